@@ -1,0 +1,11 @@
+//! The body: skeleton of 26 ball joints (78 DOF), pose and forward kinematics, shape, implicit surface, motion clip.
+
+pub mod clip;
+pub mod pose;
+pub mod shape;
+pub mod skeleton;
+
+pub use clip::Clip;
+pub use pose::{Placement, Pose, place};
+pub use shape::{Length, Shape};
+pub use skeleton::{BALL_JOINTS, DOF, Joint, NODES};

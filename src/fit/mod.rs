@@ -1,0 +1,1 @@
+//! Fitting the body to all clouds at once.

@@ -1,0 +1,1 @@
+//! Simultaneous images with times, synchronization check, foreground.

@@ -1,0 +1,5 @@
+//! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
+
+pub mod atomic;
+
+pub use atomic::write_atomic;

@@ -1,0 +1,3 @@
+//! Numerics that know no camera and no body.
+
+pub mod rotation;

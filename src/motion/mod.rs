@@ -1,0 +1,1 @@
+//! Motion synthesis at a wanted parameter, playback, retargeting.

@@ -1,0 +1,55 @@
+//! One gait cycle or one jump, resampled to N = 100 samples: the unit of the database (style paper §3).
+
+use nalgebra::{UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::body::BALL_JOINTS;
+
+/// Samples per cycle, N of the paper, at phases 0, 1/N, …
+pub const SAMPLES: usize = 100;
+/// Root channels per sample: see [`RootSample`].
+pub const ROOT_CHANNELS: usize = 6;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Activity {
+    Walking,
+    Running,
+    Jumping,
+}
+
+impl Activity {
+    /// Walking and running repeat; a jump has a start and an end.
+    pub fn is_cyclic(self) -> bool {
+        self != Activity::Jumping
+    }
+}
+
+/// The root against its carrier, a frame that moves with the heading and the mean speed of the cycle at the standing
+/// hip height: x left, y up, z forward.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RootSample {
+    /// Rotation vector of carrier_from_root, radians.
+    pub rotation: Vector3<f64>,
+    /// Position of the root in the carrier divided by the hip height H: sway (left), height of the root above the floor
+    /// minus 1 (up), progress within the cycle against uniform motion (forward). For a jump the carrier stands still at
+    /// the start, and forward is the whole progress.
+    pub position: Vector3<f64>,
+}
+
+/// One cycle of one subject.
+#[derive(Clone, Debug)]
+pub struct Cycle {
+    pub subject: String,
+    /// File and place it came from, for the reader of the model file.
+    pub source: String,
+    pub activity: Activity,
+    /// Speed in m/s, for jumps the length in m.
+    pub parameter: f64,
+    pub hip_height_m: f64,
+    pub duration_s: f64,
+    /// [`SAMPLES`] postures; index of a ball joint: `joint as usize - 1`.
+    pub joints: Vec<[UnitQuaternion<f64>; BALL_JOINTS]>,
+    /// [`SAMPLES`] root samples.
+    pub root: Vec<RootSample>,
+}

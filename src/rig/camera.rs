@@ -1,0 +1,93 @@
+//! Pinhole camera with Brown-Conrady distortion (OpenCV's model).
+//!
+//! x_in_camera = R x_in_world + t,  (x, y) = (X/Z, Y/Z),  r² = x² + y²,
+//!   x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2x²),
+//!   y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2y²) + 2 p2 x y,
+//!   u = fx x' + s y' + cx,  v = fy y' + cy.                                                         (1)
+//! The inverse is a Newton iteration; it fails beyond the radius where (1) folds over.
+//! Checked against cv::projectPoints and cv::undistortPoints.
+
+use nalgebra::{Matrix2, Matrix3, Point2, Rotation3, Vector2, Vector3};
+
+/// One calibrated camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Camera {
+    pub name: String,
+    /// Image width and height, pixels.
+    pub size_px: [u32; 2],
+    /// Camera matrix K, pixels.
+    pub matrix: Matrix3<f64>,
+    /// k1, k2, p1, p2, k3.
+    pub distortion: [f64; 5],
+    pub camera_from_world: Rotation3<f64>,
+    /// World origin in the camera, metres: `x_in_camera = camera_from_world * x_in_world + translation`.
+    pub translation: Vector3<f64>,
+}
+
+impl Camera {
+    /// Optical centre in the world, metres.
+    pub fn centre(&self) -> Vector3<f64> {
+        -(self.camera_from_world.inverse() * self.translation)
+    }
+
+    /// A world point in the camera frame, metres.
+    pub fn camera_point(&self, x_in_world: &Vector3<f64>) -> Vector3<f64> {
+        self.camera_from_world * x_in_world + self.translation
+    }
+
+    /// Pixel of a world point; `None` behind the camera (nearer than 1 mm in depth).
+    pub fn project(&self, x_in_world: &Vector3<f64>) -> Option<Point2<f64>> {
+        let p = self.camera_point(x_in_world);
+        (p.z > 1e-3).then(|| self.distorted_pixel(&Vector2::new(p.x / p.z, p.y / p.z)))
+    }
+
+    /// Pixel of the normalised image point (X/Z, Y/Z).
+    pub fn distorted_pixel(&self, normalised: &Vector2<f64>) -> Point2<f64> {
+        let d = self.distort(normalised).0;
+        let m = &self.matrix;
+        Point2::new(m[(0, 0)] * d.x + m[(0, 1)] * d.y + m[(0, 2)], m[(1, 1)] * d.y + m[(1, 2)])
+    }
+
+    /// Normalised image point (X/Z, Y/Z) of a pixel, distortion removed; `None` where the distortion has no inverse.
+    pub fn normalise(&self, pixel: &Point2<f64>) -> Option<Vector2<f64>> {
+        let m = &self.matrix;
+        let y = (pixel.y - m[(1, 2)]) / m[(1, 1)];
+        let wanted = Vector2::new((pixel.x - m[(0, 2)] - m[(0, 1)] * y) / m[(0, 0)], y);
+        let mut at = wanted;
+        for _ in 0..30 {
+            let (value, jacobian) = self.distort(&at);
+            let step = jacobian.lu().solve(&(wanted - value))?;
+            at += step;
+            if step.norm() < 1e-13 {
+                break;
+            }
+        }
+        let (value, jacobian) = self.distort(&at);
+        ((value - wanted).norm() < 1e-9 && jacobian.determinant() > 0.0).then_some(at)
+    }
+
+    /// Unit direction in the world of the ray through a pixel; `None` where the distortion has no inverse.
+    pub fn ray(&self, pixel: &Point2<f64>) -> Option<Vector3<f64>> {
+        let n = self.normalise(pixel)?;
+        Some(self.camera_from_world.inverse() * Vector3::new(n.x, n.y, 1.0).normalize())
+    }
+
+    /// Distorted normalised point and its Jacobian, equation (1).
+    fn distort(&self, n: &Vector2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
+        let [k1, k2, p1, p2, k3] = self.distortion;
+        let (x, y) = (n.x, n.y);
+        let r2 = x * x + y * y;
+        let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        let slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3));
+        let value =
+            Vector2::new(x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y);
+        let cross = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y;
+        let jacobian = Matrix2::new(
+            radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
+            cross,
+            cross,
+            radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
+        );
+        (value, jacobian)
+    }
+}

@@ -1,0 +1,1 @@
+//! Style: projection onto the model, distances, weights (style paper §4).
