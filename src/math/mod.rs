@@ -1,3 +1,5 @@
 //! Numerics that know no camera and no body.
 
+pub mod arrow;
+pub mod banded;
 pub mod rotation;
