@@ -2,4 +2,12 @@
 
 pub mod atomic;
 
+pub mod calib_toml;
+
+pub mod images;
+
+pub mod session;
+
+pub mod video;
+
 pub use atomic::write_atomic;
