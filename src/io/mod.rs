@@ -1,5 +1,12 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod asf_amc;
 pub mod atomic;
+pub mod bvh;
+pub mod mapping;
+pub mod mocap;
+pub mod mot;
+pub mod sidecar;
 
 pub use atomic::write_atomic;
+pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};
