@@ -1,5 +1,6 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod asf_amc;
 pub mod atomic;
 pub mod fit_json;
 
@@ -10,5 +11,11 @@ pub mod images;
 pub mod session;
 
 pub mod video;
+pub mod bvh;
+pub mod mapping;
+pub mod mocap;
+pub mod mot;
+pub mod sidecar;
 
 pub use atomic::write_atomic;
+pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};
