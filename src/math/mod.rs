@@ -1,3 +1,5 @@
 //! Numerics that know no camera and no body.
 
+pub mod pca;
 pub mod rotation;
+pub mod spline;
