@@ -16,6 +16,9 @@ pub mod mapping;
 pub mod mocap;
 pub mod mot;
 pub mod sidecar;
+pub mod manifest;
+pub mod model_npz;
+pub mod style_json;
 
 pub use atomic::write_atomic;
 pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};

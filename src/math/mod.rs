@@ -2,4 +2,6 @@
 
 pub mod arrow;
 pub mod banded;
+pub mod pca;
 pub mod rotation;
+pub mod spline;
