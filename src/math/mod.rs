@@ -1,3 +1,4 @@
 //! Numerics that know no camera and no body.
 
+pub mod curves;
 pub mod rotation;

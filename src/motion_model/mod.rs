@@ -2,6 +2,7 @@
 
 pub mod cycle;
 pub mod model;
+pub mod synthetic;
 
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, SAMPLES};
 pub use model::{Member, Model};
