@@ -1,4 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
+
+mod progress;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
