@@ -1,6 +1,9 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod asf_amc;
 pub mod atomic;
+pub mod fit_json;
+pub mod pfm;
 
 pub mod calib_toml;
 
@@ -8,6 +11,15 @@ pub mod images;
 
 pub mod session;
 
+pub mod bvh;
+pub mod manifest;
+pub mod mapping;
+pub mod mocap;
+pub mod model_npz;
+pub mod mot;
+pub mod sidecar;
+pub mod style_json;
 pub mod video;
 
 pub use atomic::write_atomic;
+pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};
