@@ -1,4 +1,8 @@
 //! One file per subcommand: load, call the library, save, report.
+mod generate;
+mod model;
+mod motions;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
@@ -13,10 +17,28 @@ pub struct Cli {
 }
 
 #[derive(Subcommand)]
-enum Command {}
+enum Command {
+    /// Motion databases and their PCA models
+    #[command(subcommand)]
+    Model(model::ModelCommand),
+    /// The same person at other speeds or jump lengths
+    Generate(generate::GenerateArgs),
+}
 
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
-    match cli.command {}
+    match cli.command {
+        Command::Model(command) => model::run(command),
+        Command::Generate(args) => generate::run(args),
+    }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0).ok_or("must be a positive number".into())
+}
+
+/// A part of a whole, above 0 and up to 1.
+fn part(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or("must be above 0 and at most 1".into())
 }
