@@ -1,5 +1,6 @@
 //! Numerics that know no camera and no body.
 
 pub mod pca;
+pub mod curves;
 pub mod rotation;
 pub mod spline;

@@ -5,6 +5,7 @@ pub mod cycle;
 pub mod database;
 pub mod model;
 pub mod segment;
+pub mod synthetic;
 
 pub use cadence::CadenceLaw;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
