@@ -94,11 +94,22 @@ fn build(args: BuildArgs) -> Result<()> {
     let found = recordings.cycles.len();
     let (cycles, thinned) = database::thin(recordings.cycles);
     for t in &thinned {
-        eprintln!("thinned: subject {} from {} to {} cycles, {} times the median subject's", t.subject, t.before, t.after, database::MEDIAN_MULTIPLE);
+        eprintln!(
+            "thinned: subject {} from {} to {} cycles, {} times the median subject's",
+            t.subject,
+            t.before,
+            t.after,
+            database::MEDIAN_MULTIPLE
+        );
     }
     let model = Model::build(activity, false, &cycles)?;
     write_model(&args.output, &model)?;
-    println!("{found} cycles from {} files, {} stretches or files left out, {} cycles kept", recordings.files, recordings.left_out.len(), cycles.len());
+    println!(
+        "{found} cycles from {} files, {} stretches or files left out, {} cycles kept",
+        recordings.files,
+        recordings.left_out.len(),
+        cycles.len()
+    );
     print!("{}", description(&args.output, &model));
     Ok(())
 }

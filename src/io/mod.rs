@@ -2,14 +2,14 @@
 
 pub mod asf_amc;
 pub mod atomic;
-pub mod manifest;
-pub mod model_npz;
-pub mod style_json;
 pub mod bvh;
+pub mod manifest;
 pub mod mapping;
 pub mod mocap;
+pub mod model_npz;
 pub mod mot;
 pub mod sidecar;
+pub mod style_json;
 
 pub use atomic::write_atomic;
 pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};

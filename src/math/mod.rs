@@ -1,6 +1,6 @@
 //! Numerics that know no camera and no body.
 
-pub mod pca;
 pub mod curves;
+pub mod pca;
 pub mod rotation;
 pub mod spline;
