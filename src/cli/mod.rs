@@ -2,6 +2,9 @@
 
 mod progress;
 mod disparity;
+mod generate;
+mod model;
+mod motions;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -20,6 +23,11 @@ pub struct Cli {
 enum Command {
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
+    /// Motion databases and their PCA models
+    #[command(subcommand)]
+    Model(model::ModelCommand),
+    /// The same person at other speeds or jump lengths
+    Generate(generate::GenerateArgs),
 }
 
 /// Runs the command line.
@@ -28,4 +36,16 @@ pub fn run(cli: Cli) -> Result<()> {
     match cli.command {
         Command::Disparity(args) => disparity::run(&args),
     }
+        Command::Model(command) => model::run(command),
+        Command::Generate(args) => generate::run(args),
+    }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0).ok_or("must be a positive number".into())
+}
+
+/// A part of a whole, above 0 and up to 1.
+fn part(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or("must be above 0 and at most 1".into())
 }
