@@ -5,6 +5,8 @@
 
 mod ground;
 mod posture;
+mod running;
+mod stride;
 mod variation;
 mod walking;
 
@@ -14,6 +16,8 @@ use rayon::prelude::*;
 use self::variation::{Style, add_cycle_noise, cycle_rng, normal, subject_rng, uniform};
 use super::cycle::{Activity, Cycle};
 use crate::body::{Joint, Length, NODES, Shape};
+
+pub(super) const GRAVITY: f64 = 9.81;
 
 /// One synthetic person with a way of doing one activity.
 #[derive(Clone, Debug)]
@@ -27,9 +31,8 @@ pub struct SyntheticSubject {
     style: Style,
     /// Own cadence over the population's.
     tempo: f64,
-    /// Distance between the tracks of the feet, and of a hip joint from the middle, in units of H.
+    /// Distance between the tracks of the feet in walking, in units of H.
     step_width: f64,
-    hip_breadth: f64,
     offsets: [Vector3<f64>; NODES],
 }
 
@@ -51,7 +54,6 @@ pub fn subject(activity: Activity, seed: u64) -> SyntheticSubject {
         style: if seed == 0 { Style::neutral() } else { Style::draw(&mut rng) },
         tempo,
         step_width,
-        hip_breadth: Joint::LHip.rest_position().x * stature_m / hip_height_m,
         offsets: shape.offsets(),
     }
 }
@@ -88,13 +90,20 @@ impl SyntheticSubject {
     fn make(&self, parameter: f64, repeat: Option<u32>) -> Cycle {
         let mut rng = repeat.map(|r| cycle_rng(self.seed, self.activity, parameter, r));
         let rv = parameter / self.hip_height_m;
-        let mut tracks = self.style.tracks(rv, walking::REFERENCE_RV, true, walking::population);
-        let mut cycle_s = 1.0 / (self.tempo * walking::frequency_hz(rv));
+        let (mut tracks, frequency_hz) = match self.activity {
+            Activity::Running => (self.style.tracks(rv, running::REFERENCE_RV, true, running::population), running::frequency_hz(rv)),
+            _ => (self.style.tracks(rv, walking::REFERENCE_RV, true, walking::population), walking::frequency_hz(rv)),
+        };
+        let mut cycle_s = 1.0 / (self.tempo * frequency_hz);
         if let Some(rng) = &mut rng {
             add_cycle_noise(&mut tracks, rng);
             cycle_s *= 1.0 + 0.01 * normal(rng);
         }
-        let (angles, root) = walking::cycle(self, &tracks, parameter, cycle_s);
+        let gait = match self.activity {
+            Activity::Running => running::gait(parameter, rv, cycle_s),
+            _ => walking::gait(parameter, cycle_s),
+        };
+        let (angles, root) = stride::cycle(self, &tracks, &gait);
         Cycle {
             subject: self.name.clone(),
             source: format!("synthetic, {}", repeat.map_or("mean cycle".into(), |r| format!("cycle {}", r + 1))),

@@ -16,6 +16,8 @@ const HEEL_BACK: f64 = 0.040;
 const ANKLE_HEIGHT: f64 = 0.039;
 const BALL_HEIGHT: f64 = 0.020;
 const TOE_FORWARD: f64 = 0.055;
+/// From the heel to the toe tip of a flat foot.
+pub(super) const FOOT_LENGTH: f64 = HEEL_BACK + 0.050 + TOE_FORWARD;
 /// Lowest points of a foot: heel, ball, toe tip.
 pub(super) const SOLE_POINTS: usize = 3;
 /// The sole points of both feet, left first, relative to the root, metres.
@@ -112,7 +114,8 @@ impl Angles {
     fn leg(&self, s: usize) -> [UnitQuaternion<f64>; 4] {
         let side = &self.sides[s];
         let sign = if s == 0 { 1.0 } else { -1.0 };
-        let hip = list(side.leg_lateral - self.list) * pitch(-side.hip_flexion) * yaw(-sign * side.hip_rotation - self.yaw);
+        let carrier_from_thigh = list(side.leg_lateral) * pitch(self.tilt - side.hip_flexion) * yaw(-sign * side.hip_rotation);
+        let hip = self.carrier_from_root().inverse() * carrier_from_thigh;
         let ankle = list(-side.leg_lateral) * yaw(sign * side.toe_out) * pitch(-side.ankle);
         [hip, pitch(side.knee), ankle, pitch(-side.toe)]
     }
