@@ -2,6 +2,7 @@
 
 pub mod atomic;
 pub mod pfm;
+pub mod ply;
 
 pub mod calib_toml;
 
