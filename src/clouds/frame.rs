@@ -2,7 +2,7 @@
 
 use super::cloud::Cloud;
 use super::correlate::Region;
-use super::stage::{Stage, StageOptions, changed, changed_box, person_mask, whole};
+use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
 use super::stereo::{PreparedView, StereoOptions, ViewDisparity, match_views};
 use super::{tidy, triangulate};
 use crate::rig::rectify::{Plane, Rectification};
@@ -82,12 +82,12 @@ pub fn frame_cloud(
     if stage.views.len() != planes.len() {
         return Err(CloudError::Stage(stage.views.len(), planes.len()));
     }
-    let changes: Vec<GrayImage> = planes.iter().zip(&stage.views).map(|(now, stage)| changed(now, &stage.plane, &options.stage)).collect();
-    let regions: Option<Vec<Region>> = changes.iter().map(|c| changed_box(c, &options.stage, 12)).collect();
+    let changes: Vec<Change> = planes.iter().zip(&stage.views).map(|(now, stage)| compare(now, &stage.plane, &options.stage)).collect();
+    let regions: Option<Vec<Region>> = changes.iter().map(|c| changed_box(&c.changed, &options.stage, 12)).collect();
     let Some(regions) = regions else { return Ok(nobody(rectification, cameras)) };
     let found = search(rectification, planes, &regions, range, options);
     let persons: Vec<GrayImage> =
-        (0..found.len()).map(|k| person_mask(rectification, &changes[k], &stage.views[k], &found[k].1, &options.stage)).collect();
+        (0..found.len()).map(|k| person_mask(rectification, k, &changes, &stage.views[k], &found[k].1, &options.stage)).collect();
     let disparity = inside(&found[0].1.disparity, &persons[0]);
     let mut masks = vec![None; cameras];
     for (k, view) in rectification.views.iter().enumerate() {

@@ -24,13 +24,27 @@ pub struct StageOptions {
     pub clearance_m: f64,
     /// Smallest difference in disparity from the stage, px; about three times the matching noise.
     pub clearance_px: f32,
+    /// Roughness of the ratio to the stage, in units of its median over the picture, below which a darkening counts as a shadow.
+    pub shade_roughness: f32,
+    /// Shadows reach this far behind the person where windows blur depths, metres.
+    pub shade_reach_m: f64,
+    /// Largest hole that is filled, px; gaps between arm and trunk are larger.
+    pub largest_hole_px: usize,
     /// Smallest piece of a person, px; anything smaller is noise.
     pub smallest_piece_px: usize,
 }
 
 impl Default for StageOptions {
     fn default() -> Self {
-        Self { change_sigmas: 4.0, clearance_m: 0.02, clearance_px: 0.5, smallest_piece_px: 150 }
+        Self {
+            change_sigmas: 4.0,
+            clearance_m: 0.02,
+            clearance_px: 0.5,
+            shade_roughness: 2.2,
+            shade_reach_m: 0.3,
+            largest_hole_px: 60,
+            smallest_piece_px: 150,
+        }
     }
 }
 
@@ -96,17 +110,55 @@ fn fill_line(values: &mut [f32], line: Vec<usize>) {
     }
 }
 
-/// 255 where the smoothed grey value differs from the stage's by more than the noise allows.
-pub(crate) fn changed(now: &Plane, stage: &Plane, options: &StageOptions) -> GrayImage {
-    let difference: Vec<f32> = now.iter().zip(stage.iter()).map(|(a, b)| if a.is_nan() || b.is_nan() { 0.0 } else { a - b }).collect();
-    let smooth = blur(&difference, now.width() as usize, 0.7);
-    let mut sizes: Vec<f32> = smooth.iter().zip(now.iter()).filter(|(_, n)| !n.is_nan()).map(|(s, _)| s.abs()).collect();
-    let middle = sizes.len() / 2;
-    // Most pixels show the stage, so the median change is noise; 8-bit pictures have at least rounding noise.
-    let sigma = if sizes.is_empty() { 1.0 } else { (1.4826 * *sizes.select_nth_unstable_by(middle, f32::total_cmp).1).max(0.5) };
-    let limit = options.change_sigmas * sigma;
-    let values = smooth.iter().map(|s| if s.abs() > limit { 255 } else { 0 }).collect();
-    GrayImage::from_raw(now.width(), now.height(), values).expect("one value per pixel")
+/// How a rectified picture differs from the stage's.
+#[derive(Clone, Debug)]
+pub(crate) struct Change {
+    /// Smoothed difference, grey levels.
+    pub difference: Vec<f32>,
+    /// 255 where the difference exceeds its noise.
+    pub changed: GrayImage,
+    /// 255 where the grey values are a smooth fraction of the stage's, as in a cast shadow.
+    pub shaded: GrayImage,
+}
+
+/// Compares a picture with the stage's. Most pixels must show the stage: the medians over the picture are taken for noise.
+pub(crate) fn compare(now: &Plane, stage: &Plane, options: &StageOptions) -> Change {
+    let width = now.width() as usize;
+    let both = |f: fn(f32, f32) -> f32| -> Vec<f32> {
+        now.iter().zip(stage.iter()).map(|(&a, &b)| if a.is_nan() || b.is_nan() { f32::NAN } else { f(a, b) }).collect()
+    };
+    let difference = both(|a, b| a - b);
+    let known: Vec<bool> = difference.iter().map(|d| !d.is_nan()).collect();
+    let zero = |values: Vec<f32>| -> Vec<f32> { values.into_iter().map(|v| if v.is_nan() { 0.0 } else { v }).collect() };
+    let difference = blur(&zero(difference), width, DIFFERENCE_SIGMA_PX);
+    // 8-bit pictures have at least rounding noise.
+    let noise = (1.4826 * median(difference.iter().map(|d| d.abs()), &known)).max(0.5);
+    let ratio = blur(&zero(both(|a, b| ((a.max(0.0) + DARK) / (b.max(0.0) + DARK)).ln())), width, DIFFERENCE_SIGMA_PX);
+    let coarse = blur(&ratio, width, 2.0);
+    let squares: Vec<f32> = ratio.iter().zip(&coarse).map(|(r, c)| (r - c).powi(2)).collect();
+    let roughness: Vec<f32> = blur(&squares, width, 1.5).into_iter().map(f32::sqrt).collect();
+    let smooth = options.shade_roughness * median(roughness.iter().copied(), &known);
+    let mask = |set: &dyn Fn(usize) -> bool| {
+        GrayImage::from_fn(now.width(), now.height(), |x, y| Luma([if set(y as usize * width + x as usize) { 255 } else { 0 }]))
+    };
+    let changed = mask(&|i| difference[i].abs() > options.change_sigmas * noise);
+    let shaded = mask(&|i| roughness[i] < smooth && coarse[i] < 0.0 && coarse[i] > DARKEST_SHADE);
+    Change { difference, changed, shaded }
+}
+
+/// Against noise; wider moves the outline.
+const DIFFERENCE_SIGMA_PX: f32 = 0.7;
+
+/// Grey levels added before taking ratios, so that noise in black pixels does not count.
+const DARK: f32 = 5.0;
+
+/// Logarithm of the deepest shadow: a fifth of the light. What is darker is a dark thing.
+const DARKEST_SHADE: f32 = -1.6;
+
+fn median(values: impl Iterator<Item = f32>, known: &[bool]) -> f32 {
+    let mut values: Vec<f32> = values.zip(known).filter(|(_, k)| **k).map(|(v, _)| v).collect();
+    let middle = values.len() / 2;
+    if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
 }
 
 /// The box around the changed pieces of at least the smallest size, with a margin; `None` when there are none.
@@ -125,48 +177,103 @@ pub(crate) fn changed_box(changed: &GrayImage, options: &StageOptions, margin: u
     found.map(|b| Region { x: grow(b.x, width), y: grow(b.y, height) })
 }
 
-/// Least disparity difference that counts as standing before the stage.
-fn clearance(rectification: &Rectification, stage_px: f32, options: &StageOptions) -> f32 {
-    let per_metre = f64::from(stage_px).powi(2) / (rectification.focal_px * rectification.baseline_m);
-    ((per_metre * options.clearance_m) as f32).max(options.clearance_px)
+/// Disparity difference of a distance in depth at the stage's disparity.
+fn clearance(rectification: &Rectification, stage_px: f32, distance_m: f64) -> f32 {
+    let depth = rectification.depth(f64::from(stage_px));
+    if depth > distance_m { (rectification.disparity(depth - distance_m) - f64::from(stage_px)) as f32 } else { f32::INFINITY }
 }
 
-/// The person in one rectified view: 0/255.
+/// The person in rectified view `k`: 0/255. `changes` and `found` are those of all views.
 pub(crate) fn person_mask(
     rectification: &Rectification,
-    changed: &GrayImage,
+    k: usize,
+    changes: &[Change],
     stage: &StageView,
     found: &ViewDisparity,
     options: &StageOptions,
 ) -> GrayImage {
-    const PERSON: u8 = 2;
-    const STAGE: u8 = 1;
-    let label = |((&changed, &d), &stage_d): ((&u8, &f32), &f32)| {
-        if changed == 0 || d.is_nan() {
-            0
-        } else if stage_d.is_nan() || d > stage_d + clearance(rectification, stage_d, options) {
-            PERSON
-        } else {
-            STAGE
-        }
-    };
-    let labels: Vec<u8> = changed.iter().zip(found.disparity.iter()).zip(stage.disparity.iter()).map(label).collect();
-    let (width, height) = changed.dimensions();
-    let picture = |wanted: u8| GrayImage::from_raw(width, height, labels.iter().map(|&l| if l == wanted { 255 } else { 0 }).collect());
-    let (person, ground) = (picture(PERSON).expect("same size"), picture(STAGE).expect("same size"));
-    let (near_person, near_ground) = (counts(&person, 4), counts(&ground, 4));
-    let mut mask = GrayImage::from_fn(width, height, |x, y| {
-        let i = (y * width + x) as usize;
-        let undecided = changed.as_raw()[i] != 0 && labels[i] == 0;
-        Luma([if labels[i] == PERSON || (undecided && near_person[i] > near_ground[i]) { 255 } else { 0 }])
-    });
+    let (width, height) = changes[k].changed.dimensions();
+    let labels: Vec<Label> = (0..(width * height) as usize)
+        .map(|i| label(rectification, k, i, changes, stage.disparity.as_raw()[i], found.disparity.as_raw()[i], options))
+        .collect();
+    let density =
+        |wanted: Label| blur(&labels.iter().map(|&l| if l == wanted { 1.0 } else { 0.0 }).collect::<Vec<_>>(), width as usize, 2.0);
+    let (person, ground) = (density(Label::Person), density(Label::Stage));
+    let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && person[i] > ground[i]);
+    let mut mask = GrayImage::from_fn(width, height, |x, y| Luma([if set((y * width + x) as usize) { 255 } else { 0 }]));
     mask = masks::box_vote(&mask, 1, 0.5);
     masks::keep_large(&mut mask, options.smallest_piece_px);
-    masks::fill_holes(&mut mask, 60);
+    masks::fill_holes(&mut mask, options.largest_hole_px);
+    trim_outline(&mut mask, &changes[k].difference);
     mask
 }
 
-fn counts(mask: &GrayImage, r: i32) -> Vec<f32> {
-    let values: Vec<f32> = mask.iter().map(|&v| f32::from(v != 0)).collect();
-    blur(&values, mask.width() as usize, r as f32 / 2.0)
+#[derive(Clone, Copy, PartialEq)]
+enum Label {
+    Nothing,
+    Stage,
+    Person,
+    /// Changed, but without a valid match.
+    Undecided,
+}
+
+fn label(
+    rectification: &Rectification,
+    k: usize,
+    i: usize,
+    changes: &[Change],
+    stage_px: f32,
+    disparity: f32,
+    options: &StageOptions,
+) -> Label {
+    let changed = changes[k].changed.as_raw()[i] != 0;
+    let shaded = changes[k].shaded.as_raw()[i] != 0;
+    if disparity.is_nan() {
+        return match (changed, shaded) {
+            (true, false) => Label::Undecided,
+            (true, true) => Label::Stage,
+            _ => Label::Nothing,
+        };
+    }
+    let before = disparity - stage_px;
+    let needed = clearance(rectification, stage_px, options.clearance_m).max(options.clearance_px);
+    // Windows at a foot's outline carry its depth over to the shadow beside it.
+    let beside_shadow = shaded && before < clearance(rectification, stage_px, options.shade_reach_m);
+    if !stage_px.is_nan() && (before <= needed || beside_shadow) {
+        return if changed { Label::Stage } else { Label::Nothing };
+    }
+    let votes = (0..changes.len()).filter(|&j| j == k || changed_at(rectification, k, j, i, changes, disparity)).count();
+    let votes = votes - usize::from(!changed);
+    if 2 * votes > changes.len() || (changed && changes.len() == 2) { Label::Person } else { Label::Nothing }
+}
+
+/// Whether view `j` shows a change where it sees pixel `i` of view `k` at this disparity.
+fn changed_at(rectification: &Rectification, k: usize, j: usize, i: usize, changes: &[Change], disparity: f32) -> bool {
+    let changed = &changes[j].changed;
+    let (width, height) = changed.dimensions();
+    let step = rectification.views[j].step - rectification.views[k].step;
+    let x = (i as u32 % width) as f64 + step.x * f64::from(disparity);
+    let y = (i as u32 / width) as f64 + step.y * f64::from(disparity);
+    let (x, y) = (x.round(), y.round());
+    x >= 0.0 && y >= 0.0 && x < f64::from(width) && y < f64::from(height) && changed.get_pixel(x as u32, y as u32).0[0] != 0
+}
+
+/// Drops outline pixels that changed less than half as much as their surroundings: they are mostly stage.
+fn trim_outline(mask: &mut GrayImage, difference: &[f32]) {
+    let (width, height) = (mask.width() as usize, mask.height() as usize);
+    let before = mask.clone();
+    let set = |i: usize| before.as_raw()[i] != 0;
+    for y in 1..height.saturating_sub(1) {
+        for x in 1..width.saturating_sub(1) {
+            let i = y * width + x;
+            if !set(i) || (set(i - 1) && set(i + 1) && set(i - width) && set(i + width)) {
+                continue;
+            }
+            let around = (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| y * width + x));
+            let strongest = around.map(|j| difference[j].abs()).fold(0.0, f32::max);
+            if difference[i].abs() < 0.5 * strongest {
+                mask.put_pixel(x as u32, y as u32, Luma([0]));
+            }
+        }
+    }
 }
