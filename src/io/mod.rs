@@ -4,6 +4,7 @@ pub mod asf_amc;
 pub mod atomic;
 pub mod fit_json;
 pub mod pfm;
+pub mod ply;
 
 pub mod calib_toml;
 
