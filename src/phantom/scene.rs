@@ -156,30 +156,42 @@ fn hit(camera: &Camera, eye: &mut Eye, x: u32, y: u32) -> Option<(Vector3<f64>, 
     Some((direction, eye.first_hit(&direction)?))
 }
 
-/// Pixels of the rectangle that the figure can cover.
-fn pixels(figure: &Figure, camera: &Camera) -> impl Iterator<Item = (u32, u32)> + use<> {
+/// Pixels that the figure can cover: the union of boxes around its primitives.
+fn pixels(figure: &Figure, camera: &Camera) -> Vec<(u32, u32)> {
     let [width, height] = camera.size_px;
-    let (mut low, mut high) = (Point2::new(f64::INFINITY, f64::INFINITY), Point2::new(f64::NEG_INFINITY, f64::NEG_INFINITY));
+    let mut covered = vec![false; (width * height) as usize];
     for (centre, radius) in figure.bounds() {
-        let c = camera.camera_point(&centre);
-        if c.z < -radius {
-            continue;
-        }
-        if c.z < 2.0 * radius {
-            // Too near for a box of corners to bound it.
-            (low, high) = (Point2::new(0.0, 0.0), Point2::new(width as f64, height as f64));
-            break;
-        }
-        for corner in 0..8 {
-            let side = |bit: usize| if corner >> bit & 1 == 1 { radius } else { -radius };
-            let p = c + Vector3::new(side(0), side(1), side(2));
-            let pixel = camera.distorted_pixel(&(p.xy() / p.z));
-            (low, high) = (low.inf(&pixel), high.sup(&pixel));
+        if let Some([columns, rows]) = pixel_box(camera, &centre, radius) {
+            for y in rows {
+                covered[(y * width + columns.start) as usize..(y * width + columns.end) as usize].fill(true);
+            }
         }
     }
-    let clip = |v: f64, size: u32| v.clamp(0.0, size as f64) as u32;
-    let columns = clip(low.x - 1.0, width)..clip(high.x + 2.0, width);
-    (clip(low.y - 1.0, height)..clip(high.y + 2.0, height)).flat_map(move |y| columns.clone().map(move |x| (x, y)))
+    (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).filter(|(x, y)| covered[(y * width + x) as usize]).collect()
+}
+
+/// Columns and rows that hold the picture of a sphere; `None` behind the camera.
+fn pixel_box(camera: &Camera, centre: &Vector3<f64>, radius: f64) -> Option<[std::ops::Range<u32>; 2]> {
+    let [width, height] = camera.size_px;
+    let c = camera.camera_point(centre);
+    if c.z < -radius {
+        return None;
+    }
+    if c.z < 2.0 * radius {
+        return Some([0..width, 0..height]); // too near for a box of corners to bound it
+    }
+    let (mut low, mut high) = (Point2::new(f64::INFINITY, f64::INFINITY), Point2::new(f64::NEG_INFINITY, f64::NEG_INFINITY));
+    for corner in 0..8 {
+        let side = |bit: usize| if corner >> bit & 1 == 1 { radius } else { -radius };
+        let p = c + Vector3::new(side(0), side(1), side(2));
+        let pixel = camera.distorted_pixel(&(p.xy() / p.z));
+        (low, high) = (low.inf(&pixel), high.sup(&pixel));
+    }
+    let range = |low: f64, high: f64, size: u32| {
+        let clip = |v: f64| v.clamp(0.0, size as f64) as u32;
+        clip(low - 1.0)..clip(high + 2.0)
+    };
+    Some([range(low.x, high.x, width), range(low.y, high.y, height)])
 }
 
 /// The room's grey values under the figure's shadow.

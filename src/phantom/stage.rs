@@ -11,8 +11,8 @@ pub const DIFFUSE: f64 = 0.6;
 
 /// Octaves of the room's textures. The finest is two to four pixels at 3 to 6 m through 550 px of focal length: finer
 /// ones alias, and without the coarse ones the picture is one even grey from afar.
-const FLOOR: [Octave; 4] = [(0.045, 0.16), (0.11, 0.18), (0.3, 0.16), (1.1, 0.14)];
-const WALL: [Octave; 4] = [(0.055, 0.2), (0.13, 0.24), (0.35, 0.26), (1.3, 0.2)];
+const FLOOR: [Octave; 4] = [(0.045, 0.12), (0.11, 0.12), (0.3, 0.10), (1.1, 0.08)];
+const WALL: [Octave; 4] = [(0.055, 0.16), (0.12, 0.16), (0.35, 0.12), (1.3, 0.12)];
 
 /// A box-shaped room in the rig's world; the floor is at height 0.
 #[derive(Clone, Debug)]
@@ -62,7 +62,7 @@ impl Stage {
     /// Share of the light that a point of the room reflects, 0 to 1.
     pub fn albedo(&self, x: &Vector3<f64>, normal: &Vector3<f64>) -> f64 {
         let on_floor = normal.dot(&self.up.direction()) > 0.5;
-        let (mean, layers, seed) = if on_floor { (0.50, &FLOOR, 11) } else { (0.42, &WALL, 23) };
+        let (mean, layers, seed) = if on_floor { (0.46, &FLOOR, 11) } else { (0.50, &WALL, 23) };
         // Off the lattice planes, where gradient noise is flatter.
         (mean + octaves(&(x + Vector3::repeat(0.0173)), layers, seed)).clamp(0.05, 0.95)
     }

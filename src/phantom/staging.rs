@@ -121,31 +121,39 @@ pub fn in_view(rig: &Rig, shape: &Shape, pose: &Pose) -> bool {
     })
 }
 
-/// Start (floor coordinates, metres) and heading (radians) that take the clip across the rig's view from left to right,
-/// as near as the whole of it is in view, or, if it is too long for that, a little behind where its middle is in view.
-/// `None` if no camera distance up to 5 m shows even the middle pose whole.
-pub fn cross_the_view(rig: &Rig, clip: &Clip, shape: &Shape) -> Option<([f64; 2], f64)> {
+/// Horizontal direction in which the rig looks.
+fn forward(rig: &Rig) -> Vector3<f64> {
     let up = rig.up.direction();
+    let sum: Vector3<f64> = rig.cameras.iter().map(|c| c.camera_from_world.inverse() * Vector3::z()).sum();
+    (sum - up * sum.dot(&up)).try_normalize(1e-9).unwrap_or(floor_axes(rig.up)[1])
+}
+
+/// Heading (radians) that crosses the rig's view from left to right and a little towards the cameras.
+pub fn crossing_heading(rig: &Rig) -> f64 {
+    let (forward, axes) = (forward(rig), floor_axes(rig.up));
+    let way = forward.cross(&rig.up.direction()) * TURN_TO_CAMERAS.cos() - forward * TURN_TO_CAMERAS.sin();
+    way.dot(&axes[1]).atan2(way.dot(&axes[0]))
+}
+
+/// Start (floor coordinates, metres) of a clip with this heading before the middle of the rig, as near as all of it is in
+/// view or, if it is too long for that, a little behind where its middle is in view. `None` if no distance up to 5 m shows
+/// even the middle pose whole.
+pub fn cross_the_view(rig: &Rig, clip: &Clip, shape: &Shape, heading: f64) -> Option<[f64; 2]> {
     let axes = floor_axes(rig.up);
-    let count = rig.cameras.len() as f64;
-    let centre = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / count;
-    let forward: Vector3<f64> = rig.cameras.iter().map(|c| c.camera_from_world.inverse() * Vector3::z()).sum();
-    let forward = (forward - up * forward.dot(&up)).try_normalize(1e-9)?;
-    let way = forward.cross(&up) * TURN_TO_CAMERAS.cos() - forward * TURN_TO_CAMERAS.sin();
-    let heading = way.dot(&axes[1]).atan2(way.dot(&axes[0]));
+    let centre = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len() as f64;
     let poses = poses_in_world(clip, shape, rig.up, [0.0; 2], heading);
     let half_way = (poses.first()?.root + poses.last()?.root) / 2.0;
-    let shift_to = |distance: f64| {
-        let shift = centre + forward * distance - half_way;
-        axes.map(|axis| axis * shift.dot(&axis)).iter().sum::<Vector3<f64>>()
+    let start_at = |distance: f64| axes.map(|axis| axis.dot(&(centre + forward(rig) * distance - half_way)));
+    let seen = |pose: &Pose, distance: f64| {
+        let [a, b] = start_at(distance);
+        in_view(rig, shape, &Pose { root: pose.root + axes[0] * a + axes[1] * b, ..pose.clone() })
     };
-    let moved = |pose: &Pose, distance: f64| Pose { root: pose.root + shift_to(distance), ..pose.clone() };
-    let distances = || (10..).map(|i| 0.1 * i as f64).take_while(|d| *d <= FARTHEST_M);
-    let whole = distances().find(|d| poses.iter().all(|p| in_view(rig, shape, &moved(p, *d))));
-    let nearest = poses.iter().min_by(|a, b| (a.root - half_way).norm().total_cmp(&(b.root - half_way).norm()))?;
-    let distance = whole.or_else(|| distances().find(|d| in_view(rig, shape, &moved(nearest, *d))).map(|d| (d + 0.7).min(FARTHEST_M)))?;
-    let shift = shift_to(distance);
-    Some((axes.map(|axis| shift.dot(&axis)), heading))
+    let nearest_that = |shows: &dyn Fn(f64) -> bool| (10..).map(|i| 0.1 * i as f64).take_while(|d| *d <= FARTHEST_M).find(|d| shows(*d));
+    if let Some(distance) = nearest_that(&|d| poses.iter().all(|p| seen(p, d))) {
+        return Some(start_at(distance));
+    }
+    let middle = poses.iter().min_by(|a, b| (a.root - half_way).norm().total_cmp(&(b.root - half_way).norm()))?;
+    nearest_that(&|d| seen(middle, d)).map(|d| start_at((d + 0.7).min(FARTHEST_M)))
 }
 
 /// The longest run of poses that every camera sees whole.
@@ -227,7 +235,8 @@ mod tests {
         for (seconds, whole) in [(1.2, true), (9.0, false)] {
             let clip = resample(&walk(seconds), 30.0, 0.0, 99.0);
             let shape = subject_of(&clip);
-            let (start, heading) = cross_the_view(&rig, &clip, &shape).unwrap();
+            let heading = crossing_heading(&rig);
+            let start = cross_the_view(&rig, &clip, &shape, heading).unwrap();
             let poses = poses_in_world(&clip, &shape, rig.up, start, heading);
             let run = longest_run_in_view(&rig, &shape, &poses);
             assert_eq!(run.len() == poses.len(), whole, "{run:?} of {}", poses.len());
