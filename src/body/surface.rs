@@ -23,8 +23,8 @@ use super::skeleton::Joint;
 
 /// Value of d_eff on the skin.
 pub const SKIN: f64 = 0.5 * std::f64::consts::LN_2;
-/// d_eff is not allowed below this: deep inside, where many fields add up, −½ ln F turns negative.
-const DEEPEST: f64 = 1e-3;
+/// Below this d_eff, √d_eff is continued by its tangent: deep inside, where many fields add up, −½ ln F turns negative.
+const DEEP: f64 = 0.05;
 /// Primitives whose d exceeds the smallest by this have a weight below e⁻¹⁰ and are skipped.
 const NEGLIGIBLE: f64 = 5.0;
 /// Lateral skin radius of a chain over its semi-axis.
@@ -183,12 +183,23 @@ pub struct Evaluation {
 impl Evaluation {
     /// Signed distance to the skin in metres, positive outside, equation (2).
     pub fn distance(&self) -> f64 {
-        (self.d_eff.sqrt() - SKIN.sqrt()) * self.metres_per_root()
+        (self.root() - SKIN.sqrt()) * self.metres_per_root()
+    }
+
+    /// √d_eff, continued by its tangent deep inside.
+    pub fn root(&self) -> f64 {
+        let shallow = self.d_eff.max(DEEP).sqrt();
+        shallow + (self.d_eff - self.d_eff.max(DEEP)) * self.root_slope()
+    }
+
+    /// Derivative of [`root`](Self::root) for d_eff.
+    pub fn root_slope(&self) -> f64 {
+        0.5 / self.d_eff.max(DEEP).sqrt()
     }
 
     /// 1/|∇√d_eff|, the factor that the fit freezes, metres.
     pub fn metres_per_root(&self) -> f64 {
-        2.0 * self.d_eff.sqrt() / self.gradient.norm().max(1e-6)
+        1.0 / (self.root_slope() * self.gradient.norm()).max(1e-6)
     }
 }
 
@@ -237,7 +248,7 @@ impl PosedSurface {
         }
         into.gradient /= sum;
         into.shares.iter_mut().for_each(|share| share.force /= sum);
-        into.d_eff = (nearest - 0.5 * sum.ln()).max(DEEPEST);
+        into.d_eff = nearest - 0.5 * sum.ln();
     }
 
     pub fn evaluate(&self, x: &Vector3<f64>) -> Evaluation {
@@ -314,9 +325,6 @@ mod tests {
         for p in surface.primitives.iter().step_by(5) {
             let x = p.centre + Vector3::new(0.07, -0.05, 0.04);
             let e = surface.evaluate(&x);
-            if e.d_eff < 0.05 {
-                continue; // below DEEPEST the value is clamped
-            }
             assert!((surface.field(&x).ln() * -0.5 - e.d_eff).abs() < 1e-4);
             let numeric = Vector3::from_fn(|k, _| {
                 let h = Vector3::ith(k, 1e-6);
@@ -372,9 +380,6 @@ mod tests {
                 for p in before.primitives.iter().filter(|p| p.limb == limb) {
                     let x = p.centre + Vector3::new(0.03, 0.02, -0.05);
                     let e = before.evaluate(&x);
-                    if e.d_eff < 0.05 {
-                        continue;
-                    }
                     let numeric = (plus.evaluate(&x).d_eff - minus.evaluate(&x).d_eff) / (2.0 * h);
                     let analytic: f64 = e
                         .shares

@@ -42,6 +42,14 @@ impl BandMatrix {
         self.rows[index] += value;
     }
 
+    /// Makes row and column `i` those of the identity.
+    pub fn isolate(&mut self, i: usize) {
+        for other in i.saturating_sub(self.bandwidth)..(i + self.bandwidth + 1).min(self.size) {
+            let index = self.index(i.max(other), i.min(other));
+            self.rows[index] = if other == i { 1.0 } else { 0.0 };
+        }
+    }
+
     /// The factor L with L Lᵀ = self; `None` unless positive definite.
     pub fn cholesky(&self) -> Option<BandCholesky> {
         let mut l = self.clone();
@@ -109,6 +117,9 @@ mod tests {
         let right = DMatrix::from_fn(n, 3, |i, j| ((i + 11 * j) as f64).cos());
         let expected = dense.cholesky().unwrap().solve(&right);
         assert!((band.cholesky().unwrap().solve(&right) - expected).amax() < 1e-12);
+        let mut isolated = band.clone();
+        isolated.isolate(7);
+        assert!((isolated.cholesky().unwrap().solve(&right).row(7) - right.row(7)).amax() < 1e-12);
         band.add(9, 9, -100.0);
         assert!(band.cholesky().is_none());
     }
