@@ -20,7 +20,7 @@ const REACH: f64 = 5.0;
 const BRACKET_M: f64 = 1e-3;
 const PRECISION_M: f64 = 1e-5;
 /// Cells of 3 to 15 pixels at 4 m through 550 px: what a correlation window of 7 to 15 pixels needs.
-const CLOTH: [Octave; 3] = [(0.024, 0.30), (0.052, 0.32), (0.11, 0.22)];
+const CLOTH: [Octave; 3] = [(0.024, 0.27), (0.052, 0.28), (0.11, 0.18)];
 
 /// A body at one instant.
 pub struct Figure {
@@ -201,10 +201,10 @@ fn bisect(along: &[Along], mut outside: f64, mut inside: f64) -> f64 {
 fn cloth_albedo(node: Joint) -> f64 {
     use Joint::*;
     match node {
-        LAnkle | RAnkle | LMidtarsal | RMidtarsal => 0.28,
-        Root | Sacroiliac | LHip | RHip | LKnee | RKnee => 0.36,
-        Vc4 | Skullbase | LWrist | RWrist => 0.66,
-        _ => 0.55,
+        LAnkle | RAnkle | LMidtarsal | RMidtarsal => 0.32,
+        Root | Sacroiliac | LHip | RHip | LKnee | RKnee => 0.42,
+        Vc4 | Skullbase | LWrist | RWrist => 0.68,
+        _ => 0.58,
     }
 }
 
