@@ -9,7 +9,7 @@ use super::ReportError;
 use super::canvas::{Align, Canvas, GRID, INK, LEFT, Pen, RIGHT, WHITE, skeleton, tick_label, ticks};
 use crate::body::{Clip, NODES, place};
 
-const PX_PER_M: f64 = 150.0;
+const PX_PER_M: f64 = 200.0;
 const LABEL_PX: u32 = 190;
 
 /// One row per clip: `figures` instants at equal steps of time, early ones pale, seen from the subject's right, all at one
