@@ -1,4 +1,6 @@
 //! One file per subcommand: load, call the library, save, report.
+mod disparity;
+
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
@@ -13,10 +15,15 @@ pub struct Cli {
 }
 
 #[derive(Subcommand)]
-enum Command {}
+enum Command {
+    /// Disparities of one rectified pair or triple of pictures
+    Disparity(disparity::DisparityArgs),
+}
 
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
-    match cli.command {}
+    match cli.command {
+        Command::Disparity(args) => disparity::run(&args),
+    }
 }

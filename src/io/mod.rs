@@ -1,7 +1,10 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod asf_amc;
 pub mod atomic;
 pub mod joints_csv;
+pub mod fit_json;
+pub mod pfm;
 
 pub mod calib_toml;
 
@@ -10,5 +13,14 @@ pub mod images;
 pub mod session;
 
 pub mod video;
+pub mod bvh;
+pub mod mapping;
+pub mod mocap;
+pub mod mot;
+pub mod sidecar;
+pub mod manifest;
+pub mod model_npz;
+pub mod style_json;
 
 pub use atomic::write_atomic;
+pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};

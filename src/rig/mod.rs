@@ -1,6 +1,7 @@
 //! Cameras and rigs of N cameras, three-view rectification.
 
 pub mod camera;
+pub mod rectify;
 
 pub use camera::Camera;
 
