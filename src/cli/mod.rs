@@ -1,5 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod disparity;
+mod progress;
+mod render;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -18,6 +20,8 @@ pub struct Cli {
 enum Command {
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
+    /// Phantom footage of a motion file before a rig, with its truth
+    Render(render::RenderArgs),
 }
 
 /// Runs the command line.
@@ -25,5 +29,6 @@ pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
         Command::Disparity(args) => disparity::run(&args),
+        Command::Render(args) => render::run(&args),
     }
 }

@@ -78,9 +78,10 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     ensure!(args.noise.is_finite() && args.noise >= 0.0, "--noise must be 0 or more grey levels");
     ensure!(args.depth_every != Some(0), "--depth-every must be 1 or more");
     let rig = calib_toml::read_rig(&args.rig)?;
-    let clip = read_clip(&args.motion)?;
-    let shape = args.stature.map_or_else(|| staging::subject_of(&clip), Shape::template);
-    let clip = staging::resample(&clip, args.fps, args.from, args.to.unwrap_or(f64::INFINITY));
+    let read = read_clip(&args.motion)?;
+    read.notices.iter().for_each(|notice| eprintln!("notice: {notice}"));
+    let shape = args.stature.map_or_else(|| staging::subject_of(&read.clip), Shape::template);
+    let clip = staging::resample(&read.clip, args.fps, args.from, args.to.unwrap_or(f64::INFINITY));
     ensure!(!clip.poses.is_empty(), "{}: nothing between --from and --to; the motion is shorter", args.motion.display());
     let poses = stage(args, &rig, &clip, &shape)?;
     let path: Vec<_> = poses.iter().map(|p| p.root).collect();
@@ -88,7 +89,14 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     scene.noise_grey = args.noise;
     scene.seed = args.seed;
     write_session(&args.output, &Take { scene: &scene, rig: &rig, poses: &poses, fps: args.fps, depth_every: args.depth_every })?;
-    println!("{}: {} frames of {} cameras, {} frames/s, stature {:.2} m", args.output.display(), poses.len(), rig.cameras.len(), args.fps, shape.stature_m);
+    println!(
+        "{}: {} frames of {} cameras, {} frames/s, stature {:.2} m",
+        args.output.display(),
+        poses.len(),
+        rig.cameras.len(),
+        args.fps,
+        shape.stature_m
+    );
     Ok(())
 }
 
@@ -120,7 +128,10 @@ pub fn write_session(folder: &Path, take: &Take) -> Result<()> {
     ensure!(!occupied, "{}: exists already; remove it or choose another folder with -o", folder.display());
     let parent = folder.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))?;
-    let partial = tempfile::Builder::new().prefix(".rendering").tempdir_in(parent).with_context(|| format!("cannot write in {}", parent.display()))?;
+    let partial = tempfile::Builder::new()
+        .prefix(".rendering")
+        .tempdir_in(parent)
+        .with_context(|| format!("cannot write in {}", parent.display()))?;
     write_truth(partial.path(), take)?;
     write_pictures(partial.path(), take)?;
     make_readable(partial.path())?;
@@ -189,4 +200,84 @@ fn write_depth(path: &Path, map: &DepthMap) -> Result<()> {
     let mut png = Vec::new();
     PngEncoder::new(&mut png).write_image(&bytes, map.width(), map.height(), ColorType::L16.into())?;
     write_atomic(path, &png).with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use muybridge::io::session::Session;
+    use muybridge::rig::{Camera, Up};
+    use nalgebra::{Matrix3, Rotation3, Vector3};
+
+    /// Two small cameras 1 m above the floor of a y-up world, looking along -z.
+    fn rig() -> Rig {
+        let camera = |name: &str, x: f64| Camera {
+            name: name.into(),
+            size_px: [96, 72],
+            matrix: Matrix3::new(80.0, 0.0, 47.5, 0.0, 80.0, 35.5, 0.0, 0.0, 1.0),
+            distortion: [-0.05, 0.0, 0.0, 0.0, 0.0],
+            camera_from_world: Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
+            translation: Vector3::new(-x, 1.0, 0.0),
+        };
+        Rig { cameras: vec![camera("cam_00", 0.0), camera("cam_01", 0.2)], up: Up::Y }
+    }
+
+    fn two_steps(shape: &Shape) -> Clip {
+        let root = shape.offsets()[0];
+        let poses = [0.0, 0.5].map(|z| Pose::rest(root + Vector3::new(0.0, 0.0, z))).to_vec();
+        Clip { fps: 2.0, poses, offsets: shape.offsets(), hip_height_m: shape.hip_height_m() }
+    }
+
+    #[test]
+    fn session_opens_as_footage_with_its_truth_and_is_not_overwritten() {
+        let (rig, shape) = (rig(), Shape::template(1.6));
+        let heading = staging::crossing_heading(&rig);
+        let start = staging::cross_the_view(&rig, &two_steps(&shape), &shape, heading).unwrap();
+        let poses = staging::poses_in_world(&two_steps(&shape), &shape, rig.up, start, heading);
+        let scene = Scene::new(Stage::around(&rig, &[poses[0].root, poses[1].root]), &shape);
+        let take = Take { scene: &scene, rig: &rig, poses: &poses, fps: 2.0, depth_every: Some(2) };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("study/walk");
+        write_session(&path, &take).unwrap();
+
+        let (session, _) = Session::open(&path, None).unwrap();
+        assert_eq!((session.fps, session.frame_count, session.rig.up), (2.0, 2, Up::Y));
+        let view = View::new(&scene.stage, &rig.cameras[1], 1);
+        assert_eq!(session.frame(1).unwrap().images[1], render(&scene, &view, &poses[1], 1));
+        assert_eq!(session.backgrounds.unwrap()[1], render_stage(&scene, &view));
+        let joints = std::fs::read_to_string(path.join("truth/joints.csv")).unwrap();
+        let pelvis = joints.lines().find(|l| l.starts_with("1,0.500000,pelvis,")).unwrap();
+        let z: f64 = pelvis.rsplit(',').next().unwrap().parse().unwrap();
+        assert!((z - poses[1].root.z).abs() < 1e-5);
+
+        let map = image::open(path.join("truth/depth_cam_01/000000.png")).unwrap().into_luma16();
+        let truth = depth(&scene, &view, &poses[0]);
+        let seen = truth.iter().zip(map.iter()).filter(|(d, _)| **d < 6.5);
+        assert!(seen.clone().count() > 1000);
+        assert!(seen.clone().all(|(d, steps)| (d - *steps as f32 * 1e-4).abs() < 6e-5));
+        assert!(!path.join("truth/depth_cam_01/000001.png").exists());
+
+        let error = write_session(&path, &take).unwrap_err().to_string();
+        assert!(error.contains("exists already"), "{error}");
+        assert_eq!(path.parent().unwrap().read_dir().unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_rig_below_the_floor_is_refused_before_anything_is_written() {
+        let mut rig = rig();
+        rig.cameras[1].translation.y = -1.0;
+        let shape = Shape::template(1.6);
+        let scene = Scene::new(Stage::around(&rig, &[Vector3::new(0.0, 0.9, -3.0)]), &shape);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("walk");
+        let error = write_session(&path, &Take { scene: &scene, rig: &rig, poses: &[], fps: 30.0, depth_every: None }).unwrap_err();
+        assert!(error.to_string().starts_with("cam_01: stands 1.00 m below the floor"), "{error}");
+        assert_eq!(folder.path().read_dir().unwrap().count(), 0);
+    }
+
+    #[test]
+    fn points_are_two_numbers() {
+        assert_eq!(parse_point("-1.2, 3"), Ok([-1.2, 3.0]));
+        assert!(["1", "1,2,3", "a,b", "1,NaN", ""].iter().all(|t| parse_point(t).is_err()));
+    }
 }

@@ -10,8 +10,8 @@ use crate::body::{Joint, NODES};
 
 #[derive(Debug, thiserror::Error)]
 pub enum JointsCsvError {
-    #[error("cannot write {path}: {source}")]
-    Io { path: PathBuf, source: std::io::Error },
+    #[error("cannot write {path}: {error}")]
+    Io { path: PathBuf, error: std::io::Error },
     #[error("{path}: {numbers} frame numbers but {positions} frames of positions")]
     Counts { path: PathBuf, numbers: usize, positions: usize },
     #[error("{path}: frame {frame}: position of {joint} is not finite")]
@@ -59,7 +59,7 @@ pub fn write(path: &Path, frames: &[(usize, f64)], positions: &[[Vector3<f64>; N
             let _ = writeln!(text, "{frame},{time_s:.6},{name},{:.5},{:.5},{:.5}", x.x, x.y, x.z);
         }
     }
-    write_atomic(path, text.as_bytes()).map_err(|source| JointsCsvError::Io { path: path.into(), source })
+    write_atomic(path, text.as_bytes()).map_err(|error| JointsCsvError::Io { path: path.into(), error })
 }
 
 #[cfg(test)]

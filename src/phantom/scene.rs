@@ -1,7 +1,7 @@
 //! Images, depth maps and masks of the phantom.
 //!
-//! Rays go through the camera's distortion. The room is cast once per camera with 3×3 rays per pixel, the body with 2×2
-//! where it can be; grey = 255 · albedo · (ambient + diffuse · max(0, n·l) · (1 − shadow)); then Gaussian sensor noise
+//! Rays go through the camera's distortion, 2×2 per pixel. The room is cast once per camera, the body where it can be;
+//! grey = 255 · albedo · (ambient + diffuse · max(0, n·l) · (1 − shadow)); then Gaussian sensor noise
 //! from a ChaCha stream per frame and camera, and rounding. Not modelled: lens blur, motion blur, shadows on the body
 //! itself. Checked against the closed forms of a ball and of the floor.
 
@@ -22,9 +22,6 @@ pub type DepthMap = ImageBuffer<Luma<f32>, Vec<f32>>;
 
 /// Stream of the empty-stage pictures' noise.
 const EMPTY_STAGE: u64 = 0xffff_ffff;
-/// Rays per pixel side: of the room, of the body.
-const ROOM_RAYS: u32 = 3;
-const BODY_RAYS: u32 = 2;
 
 /// A room and a body.
 #[derive(Clone, Debug)]
@@ -50,8 +47,16 @@ struct RoomPixel {
     grey: f32,
     /// Share of `grey` that comes from the light and not from all around.
     direct: f32,
-    /// Seen point; `None` where the distortion has no inverse.
-    point: Option<Vector3<f64>>,
+    /// `None` where the distortion has no inverse.
+    seen: Option<Seen>,
+}
+
+#[derive(Clone)]
+struct Seen {
+    /// Point of the room at the pixel's centre.
+    point: Vector3<f64>,
+    /// Directions in the world of the rays through the pixel.
+    rays: [Vector3<f32>; 4],
 }
 
 impl Scene {
@@ -76,26 +81,23 @@ impl View {
 
 fn room_pixel(stage: &Stage, camera: &Camera, x: u32, y: u32) -> RoomPixel {
     let origin = camera.centre();
-    let see = |pixel: Point2<f64>| {
-        let direction = camera.ray(&pixel)?;
-        let (t, normal) = stage.hit(&origin, &direction);
-        Some((origin + direction * t, normal))
+    let see = |direction: &Vector3<f64>| {
+        let (t, normal) = stage.hit(&origin, direction);
+        (origin + direction * t, normal)
     };
-    let Some((point, normal)) = see(Point2::new(x as f64, y as f64)) else {
-        return RoomPixel { grey: 0.0, direct: 0.0, point: None };
+    let centre = camera.ray(&Point2::new(x as f64, y as f64));
+    // The four centres of the pixel's quarters.
+    let rays =
+        [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)].map(|(dx, dy)| camera.ray(&Point2::new(x as f64 + dx, y as f64 + dy)));
+    let (Some(centre), [Some(a), Some(b), Some(c), Some(d)]) = (centre, rays) else {
+        return RoomPixel { grey: 0.0, direct: 0.0, seen: None };
     };
+    let (point, normal) = see(&centre);
     let light = AMBIENT + stage.direct(&normal);
-    let samples = subpixels(x, y, ROOM_RAYS).filter_map(see);
-    let (sum, count) =
-        samples.fold((0.0, 0), |(sum, n), (x, normal)| (sum + stage.albedo(&x, &normal) * (AMBIENT + stage.direct(&normal)), n + 1));
-    let mean = if count > 0 { sum / count as f64 } else { stage.albedo(&point, &normal) * light };
-    RoomPixel { grey: (255.0 * mean) as f32, direct: ((light - AMBIENT) / light) as f32, point: Some(point) }
-}
-
-/// The centres of n×n squares that tile a pixel.
-fn subpixels(x: u32, y: u32, n: u32) -> impl Iterator<Item = Point2<f64>> {
-    let at = move |i: u32| (i as f64 + 0.5) / n as f64 - 0.5;
-    (0..n * n).map(move |i| Point2::new(x as f64 + at(i % n), y as f64 + at(i / n)))
+    let reflected = |(x, normal): (Vector3<f64>, Vector3<f64>)| stage.albedo(&x, &normal) * (AMBIENT + stage.direct(&normal));
+    let mean = [a, b, c, d].iter().map(|ray| reflected(see(ray))).sum::<f64>() / 4.0;
+    let seen = Some(Seen { point, rays: [a, b, c, d].map(|ray| ray.cast()) });
+    RoomPixel { grey: (255.0 * mean) as f32, direct: ((light - AMBIENT) / light) as f32, seen }
 }
 
 /// What `view` records of the body in `pose` (rig's world) at number `frame`.
@@ -106,7 +108,9 @@ pub fn render(scene: &Scene, view: &View, pose: &Pose, frame: usize) -> GrayImag
     let width = view.camera.size_px[0];
     for (x, y) in pixels(&figure, &view.camera) {
         let at = (y * width + x) as usize;
-        grey[at] = body_pixel(&scene.stage, &view.camera, &mut eye, x, y, grey[at]);
+        if let Some(seen) = &view.room[at].seen {
+            grey[at] = body_pixel(&scene.stage, &mut eye, &seen.rays, grey[at]);
+        }
     }
     expose(scene, view, &grey, frame as u64)
 }
@@ -121,7 +125,7 @@ pub fn render_stage(scene: &Scene, view: &View) -> GrayImage {
 pub fn depth(scene: &Scene, view: &View, pose: &Pose) -> DepthMap {
     let [width, height] = view.camera.size_px;
     let axial = |x: &Vector3<f64>| view.camera.camera_point(x).z as f32;
-    let room = view.room.iter().map(|p| p.point.as_ref().map_or(f32::INFINITY, axial)).collect();
+    let room = view.room.iter().map(|p| p.seen.as_ref().map_or(f32::INFINITY, |s| axial(&s.point))).collect();
     let mut map = DepthMap::from_raw(width, height, room).unwrap_or_default();
     let figure = scene.figure(pose);
     let mut eye = figure.seen_from(&view.camera.centre());
@@ -204,7 +208,7 @@ fn shadowed_room(stage: &Stage, view: &View, figure: &Figure) -> Vec<f32> {
     let (middle, radius) = ((low + high) / 2.0, (high - low).norm() / 2.0);
     let mut scratch = Shadow::default();
     let mut shade = |p: &RoomPixel| {
-        let Some(point) = p.point.filter(|_| p.direct > 0.0) else { return p.grey };
+        let Some(point) = p.seen.as_ref().filter(|_| p.direct > 0.0).map(|s| s.point) else { return p.grey };
         let to = middle - point;
         let aside = to - stage.to_light * to.dot(&stage.to_light);
         if aside.norm_squared() > radius * radius {
@@ -215,15 +219,12 @@ fn shadowed_room(stage: &Stage, view: &View, figure: &Figure) -> Vec<f32> {
     view.room.iter().map(&mut shade).collect()
 }
 
-fn body_pixel(stage: &Stage, camera: &Camera, eye: &mut Eye, x: u32, y: u32, room: f32) -> f32 {
-    let mut sum = 0.0;
-    for pixel in subpixels(x, y, BODY_RAYS) {
-        sum += match camera.ray(&pixel).and_then(|direction| eye.look(&direction)) {
-            Some(skin) => (255.0 * skin.albedo * (AMBIENT + stage.direct(&skin.normal))) as f32,
-            None => room,
-        };
-    }
-    sum / (BODY_RAYS * BODY_RAYS) as f32
+fn body_pixel(stage: &Stage, eye: &mut Eye, rays: &[Vector3<f32>; 4], room: f32) -> f32 {
+    let see = |ray: &Vector3<f32>| match eye.look(&ray.cast()) {
+        Some(skin) => (255.0 * skin.albedo * (AMBIENT + stage.direct(&skin.normal))) as f32,
+        None => room,
+    };
+    rays.iter().map(see).sum::<f32>() / 4.0
 }
 
 /// Adds sensor noise and rounds.

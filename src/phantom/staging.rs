@@ -224,7 +224,7 @@ mod tests {
         let expected = clip.poses[0].root + (clip.poses[100].root - clip.poses[0].root) * (0.1 + 7.0 / 30.0);
         assert!((at_30.poses[7].root - expected).norm() < 1e-9);
         let angle = at_30.poses[7].joint(Joint::LHip).scaled_axis().x;
-        assert!((angle - 0.5 * (5.0 * (0.1 + 7.0 / 30.0) as f64).sin()).abs() < 2e-4);
+        assert!((angle - 0.5 * (5.0 * (0.1 + 7.0 / 30.0_f64)).sin()).abs() < 2e-4);
         assert_eq!(resample(&clip, 50.0, -1.0, 99.0).poses.len(), 51);
         assert_eq!(resample(&clip, 50.0, 2.0, 99.0).poses.len(), 0);
     }

@@ -26,15 +26,15 @@ pub use overlay::{overlay, strip};
 pub enum ReportError {
     #[error("drawing failed: {0}")]
     Draw(#[from] opencv::Error),
-    #[error("cannot encode {path}: {source}")]
-    Encode { path: PathBuf, source: image::ImageError },
-    #[error("cannot write {path}: {source}")]
-    Write { path: PathBuf, source: std::io::Error },
+    #[error("cannot encode {path}: {error}")]
+    Encode { path: PathBuf, error: image::ImageError },
+    #[error("cannot write {path}: {error}")]
+    Write { path: PathBuf, error: std::io::Error },
 }
 
 /// Writes a picture as PNG.
 pub fn save(path: &Path, picture: &RgbImage) -> Result<(), ReportError> {
     let mut png = std::io::Cursor::new(Vec::new());
-    picture.write_to(&mut png, ImageFormat::Png).map_err(|source| ReportError::Encode { path: path.into(), source })?;
-    write_atomic(path, png.get_ref()).map_err(|source| ReportError::Write { path: path.into(), source })
+    picture.write_to(&mut png, ImageFormat::Png).map_err(|error| ReportError::Encode { path: path.into(), error })?;
+    write_atomic(path, png.get_ref()).map_err(|error| ReportError::Write { path: path.into(), error })
 }
