@@ -1,4 +1,6 @@
 //! One file per subcommand: load, call the library, save, report.
+
+mod progress;
 mod disparity;
 mod progress;
 mod render;
