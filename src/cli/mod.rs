@@ -5,6 +5,8 @@ mod disparity;
 mod generate;
 mod model;
 mod motions;
+mod progress;
+mod render;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -28,6 +30,8 @@ enum Command {
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
+    /// Phantom footage of a motion file before a rig, with its truth
+    Render(render::RenderArgs),
 }
 
 /// Runs the command line.
@@ -35,6 +39,7 @@ pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
         Command::Disparity(args) => disparity::run(&args),
+        Command::Render(args) => render::run(&args),
     }
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),

@@ -2,6 +2,7 @@
 
 pub mod asf_amc;
 pub mod atomic;
+pub mod joints_csv;
 pub mod fit_json;
 pub mod pfm;
 pub mod ply;
