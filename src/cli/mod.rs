@@ -1,6 +1,5 @@
 //! One file per subcommand: load, call the library, save, report.
 
-mod progress;
 mod disparity;
 mod generate;
 mod model;
@@ -40,7 +39,6 @@ pub fn run(cli: Cli) -> Result<()> {
     match cli.command {
         Command::Disparity(args) => disparity::run(&args),
         Command::Render(args) => render::run(&args),
-    }
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
     }
