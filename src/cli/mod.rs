@@ -2,6 +2,7 @@
 mod generate;
 mod model;
 mod motions;
+mod disparity;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -23,6 +24,8 @@ enum Command {
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
+    /// Disparities of one rectified pair or triple of pictures
+    Disparity(disparity::DisparityArgs),
 }
 
 /// Runs the command line.
@@ -41,4 +44,6 @@ fn positive(text: &str) -> Result<f64, String> {
 /// A part of a whole, above 0 and up to 1.
 fn part(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or("must be above 0 and at most 1".into())
+        Command::Disparity(args) => disparity::run(&args),
+    }
 }

@@ -1,1 +1,14 @@
 //! Simultaneous images with times, synchronization check, foreground.
+
+use image::GrayImage;
+
+/// What all cameras saw at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameSet {
+    /// The number in the file names, or the position in the videos from 0.
+    pub number: usize,
+    /// Time since the first frame; dropped frames count.
+    pub time_s: f64,
+    /// One picture per camera, in the rig's order and of the rig's sizes.
+    pub images: Vec<GrayImage>,
+}

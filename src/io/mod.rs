@@ -2,6 +2,16 @@
 
 pub mod asf_amc;
 pub mod atomic;
+pub mod fit_json;
+pub mod pfm;
+
+pub mod calib_toml;
+
+pub mod images;
+
+pub mod session;
+
+pub mod video;
 pub mod bvh;
 pub mod manifest;
 pub mod mapping;
@@ -9,6 +19,8 @@ pub mod mocap;
 pub mod model_npz;
 pub mod mot;
 pub mod sidecar;
+pub mod manifest;
+pub mod model_npz;
 pub mod style_json;
 
 pub use atomic::write_atomic;

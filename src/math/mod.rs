@@ -1,5 +1,8 @@
 //! Numerics that know no camera and no body.
 
+pub mod arrow;
+pub mod banded;
+pub mod pca;
 pub mod curves;
 pub mod pca;
 pub mod rotation;

@@ -63,7 +63,9 @@ impl Camera {
             }
         }
         let (value, jacobian) = self.distort(&at);
-        ((value - wanted).norm() < 1e-9 && jacobian.determinant() > 0.0).then_some(at)
+        // Both eigenvalues of the symmetric Jacobian are positive on this side of the fold only.
+        let before_fold = jacobian.determinant() > 0.0 && jacobian.trace() > 0.0;
+        ((value - wanted).norm() < 1e-9 && before_fold).then_some(at)
     }
 
     /// Unit direction in the world of the ray through a pixel; `None` where the distortion has no inverse.
@@ -89,5 +91,91 @@ impl Camera {
             radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
         );
         (value, jacobian)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use opencv::calib3d;
+    use opencv::core::{Mat, Point2d, Point3d, Vector as CvVector};
+
+    fn camera() -> Camera {
+        Camera {
+            name: "cam_00".into(),
+            size_px: [640, 480],
+            matrix: Matrix3::new(553.5, 0.0, 318.0, 0.0, 549.0, 239.2, 0.0, 0.0, 1.0),
+            distortion: [-0.31, 0.12, 1.3e-3, -0.9e-3, -0.02],
+            camera_from_world: Rotation3::from_scaled_axis(Vector3::new(1.62, -0.02, 0.05)),
+            translation: Vector3::new(0.1, 0.95, 0.05),
+        }
+    }
+
+    fn cv_matrix(camera: &Camera) -> Mat {
+        let m = &camera.matrix;
+        let rows: Vec<[f64; 3]> = (0..3).map(|r| [m[(r, 0)], m[(r, 1)], m[(r, 2)]]).collect();
+        Mat::from_slice_2d(&rows).unwrap()
+    }
+
+    fn grid_px() -> impl Iterator<Item = Point2<f64>> {
+        (0..=8).flat_map(|i| (0..=6).map(move |k| Point2::new(639.0 / 8.0 * f64::from(i), 479.0 / 6.0 * f64::from(k))))
+    }
+
+    #[test]
+    fn projection_matches_opencv() {
+        let camera = camera();
+        let points: Vec<_> = (0..60)
+            .map(|i| f64::from(i))
+            .map(|i| Vector3::new((i * 0.7).sin(), 3.0 + (i * 0.3).cos(), 1.0 + 0.8 * (i * 1.1).sin()))
+            .collect();
+        let objects: CvVector<Point3d> = points.iter().map(|p| Point3d::new(p.x, p.y, p.z)).collect();
+        let rotation = camera.camera_from_world.scaled_axis();
+        let mut pixels = CvVector::<Point2d>::new();
+        calib3d::project_points_def(
+            &objects,
+            &Mat::from_slice(rotation.as_slice()).unwrap(),
+            &Mat::from_slice(camera.translation.as_slice()).unwrap(),
+            &cv_matrix(&camera),
+            &Mat::from_slice(&camera.distortion).unwrap(),
+            &mut pixels,
+        )
+        .unwrap();
+        for (point, expected) in points.iter().zip(pixels) {
+            let pixel = camera.project(point).unwrap();
+            assert!((pixel - Point2::new(expected.x, expected.y)).norm() < 1e-9, "{point:?}: {pixel:?}, OpenCV {expected:?}");
+        }
+    }
+
+    #[test]
+    fn normalise_matches_opencv_and_inverts_the_distortion() {
+        let camera = camera();
+        let pixels: CvVector<Point2d> = grid_px().map(|p| Point2d::new(p.x, p.y)).collect();
+        let mut expected = CvVector::<Point2d>::new();
+        let criteria = opencv::core::TermCriteria::new(3, 200, 1e-14).unwrap();
+        let none = Mat::default();
+        let distortion = Mat::from_slice(&camera.distortion).unwrap();
+        calib3d::undistort_points_iter(&pixels, &mut expected, &cv_matrix(&camera), &distortion, &none, &none, criteria).unwrap();
+        for (pixel, expected) in grid_px().zip(expected) {
+            let n = camera.normalise(&pixel).unwrap();
+            assert!((n - Vector2::new(expected.x, expected.y)).norm() < 1e-9, "{pixel:?}: {n:?}, OpenCV {expected:?}");
+            assert!((camera.distorted_pixel(&n) - pixel).norm() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn rays_pass_through_their_points_and_points_behind_have_no_pixel() {
+        let camera = camera();
+        let point = Vector3::new(0.4, 3.1, 1.2);
+        let ray = camera.ray(&camera.project(&point).unwrap()).unwrap();
+        assert!(((point - camera.centre()).normalize() - ray).norm() < 1e-12);
+        assert!(camera.project(&Vector3::new(0.4, -3.1, 1.2)).is_none());
+    }
+
+    #[test]
+    fn pixels_beyond_the_fold_of_the_distortion_have_no_inverse() {
+        // x (1 - 0.3 x²) never exceeds 0.703.
+        let camera = Camera { distortion: [-0.3, 0.0, 0.0, 0.0, 0.0], ..camera() };
+        assert!(camera.normalise(&Point2::new(318.0 + 553.5 * 0.69, 239.2)).is_some());
+        assert!(camera.normalise(&Point2::new(318.0 + 553.5 * 0.72, 239.2)).is_none());
     }
 }

@@ -1,0 +1,73 @@
+//! `muybridge disparity`: one rectified pair or triple.
+
+use anyhow::{Context, Result, bail};
+use image::GrayImage;
+use muybridge::clouds::correlate::Region;
+use muybridge::clouds::stereo::{PreparedView, StereoOptions, match_views};
+use muybridge::io::pfm::write_pfm;
+use muybridge::rig::rectify::Plane;
+use nalgebra::Vector2;
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args)]
+pub struct DisparityArgs {
+    /// Rectified left picture, grey or colour.
+    #[arg(long)]
+    left: PathBuf,
+    /// Rectified right picture.
+    #[arg(long)]
+    right: PathBuf,
+    /// A third picture, rectified together with the others.
+    #[arg(long, requires = "third_baseline")]
+    third: Option<PathBuf>,
+    /// Place of the third camera in units of the left-right baseline, x right and y down: 0,1 is an L's other arm, 2,0 a further
+    /// camera in a row, -1,0 one on the other side.
+    #[arg(long, value_name = "X,Y", allow_hyphen_values = true, requires = "third", value_parser = two_numbers)]
+    third_baseline: Option<[f64; 2]>,
+    /// Largest disparity between left and right, pixels.
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=4096))]
+    max_disparity: u16,
+    /// Portable float map: the left view's disparities in pixels, infinity where there is none.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+fn two_numbers(text: &str) -> Result<[f64; 2], String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|n| n.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect();
+    match numbers.as_deref() {
+        Some(&[x, y]) if x != 0.0 || y != 0.0 => Ok([x, y]),
+        _ => Err(format!("'{text}' is not a place X,Y other than 0,0")),
+    }
+}
+
+pub fn run(args: &DisparityArgs) -> Result<()> {
+    let left = read_grey(&args.left)?;
+    let right = read_grey(&args.right)?;
+    let mut views = vec![(&args.left, left, Vector2::zeros()), (&args.right, right, Vector2::new(-1.0, 0.0))];
+    if let (Some(path), Some([x, y])) = (&args.third, args.third_baseline) {
+        views.push((path, read_grey(path)?, Vector2::new(-x, -y)));
+    }
+    let size = views[0].1.dimensions();
+    if let Some((path, image, _)) = views.iter().find(|v| v.1.dimensions() != size) {
+        let (w, h) = image.dimensions();
+        bail!(
+            "{} is {w}x{h} pixels but {} is {}x{}; rectified pictures have one size",
+            path.display(),
+            args.left.display(),
+            size.0,
+            size.1
+        );
+    }
+    let views: Vec<PreparedView> = views.iter().map(|(_, image, step)| PreparedView::new(plane(image), *step)).collect();
+    let all = Region { x: [0, size.0 as usize], y: [0, size.1 as usize] };
+    let found = match_views(&views, &vec![all; views.len()], [0, args.max_disparity.into()], &StereoOptions::default(), &[]);
+    Ok(write_pfm(&args.output, &found[0].disparity)?)
+}
+
+fn read_grey(path: &Path) -> Result<GrayImage> {
+    Ok(image::open(path).with_context(|| format!("cannot read the picture {}", path.display()))?.into_luma8())
+}
+
+fn plane(image: &GrayImage) -> Plane {
+    Plane::from_fn(image.width(), image.height(), |x, y| image::Luma([f32::from(image.get_pixel(x, y).0[0])]))
+}

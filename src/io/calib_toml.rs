@@ -1,0 +1,257 @@
+//! Rig files in the form of aniposelib and Pose2Sim, `Calib.toml`.
+//!
+//! Every table but `[metadata]` is a camera, named by its table and sorted naturally: `size` [width, height] px, `matrix`
+//! 3x3 px, `distortions` of 4 (k1, k2, p1, p2) or 5 (and k3) terms, `rotation` a Rodrigues vector, `translation` metres,
+//! with x_in_camera = R x_in_world + t. `[metadata] up = "y"` or `"z"` (the default). Other keys are ignored.
+//! Checked against real files of both tools and by a round trip.
+
+use super::write_atomic;
+use crate::math::rotation;
+use crate::rig::{Camera, Rig, RigError, Up};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use toml::{Table, Value};
+
+/// What can be wrong with a rig file; every message names it.
+#[derive(Debug, thiserror::Error)]
+pub enum CalibError {
+    #[error("{}: cannot be read: {error}", path.display())]
+    Read { path: PathBuf, error: std::io::Error },
+    #[error("{}: cannot be written: {error}", path.display())]
+    Write { path: PathBuf, error: std::io::Error },
+    #[error("{}: is not TOML: {message}", path.display())]
+    Syntax { path: PathBuf, message: String },
+    #[error("{}: has no camera table; write one [cam_NN] per camera", path.display())]
+    NoCameras { path: PathBuf },
+    #[error("{}: [{table}] has no `{key}`; it must be {expected}", path.display())]
+    MissingKey { path: PathBuf, table: String, key: &'static str, expected: &'static str },
+    #[error("{}: [{table}] `{key}` must be {expected}", path.display())]
+    WrongValue { path: PathBuf, table: String, key: &'static str, expected: &'static str },
+    #[error("{}: [{table}] is a fisheye camera, which is not supported; calibrate it with the pinhole model (fisheye = false)", path.display())]
+    Fisheye { path: PathBuf, table: String },
+    #[error("{}: {error}", path.display())]
+    Rig { path: PathBuf, error: RigError },
+}
+
+/// Reads a rig and refuses it where [`Rig::validate`] does.
+pub fn read_rig(path: &Path) -> Result<Rig, CalibError> {
+    let text = std::fs::read_to_string(path).map_err(|error| CalibError::Read { path: path.into(), error })?;
+    let tables: Table = text.parse().map_err(|e| syntax_error(path, &text, &e))?;
+    let up = read_up(path, &tables)?;
+    let mut named: Vec<(&String, &Table)> =
+        tables.iter().filter(|(name, _)| *name != "metadata").filter_map(|(name, value)| Some((name, value.as_table()?))).collect();
+    named.sort_by(|a, b| natord::compare(a.0, b.0));
+    if named.is_empty() {
+        return Err(CalibError::NoCameras { path: path.into() });
+    }
+    let cameras = named.into_iter().map(|(name, table)| CameraTable { path, name, table }.camera()).collect::<Result<_, _>>()?;
+    let rig = Rig { cameras, up };
+    rig.validate().map_err(|error| CalibError::Rig { path: path.into(), error })?;
+    Ok(rig)
+}
+
+/// Writes a rig; [`read_rig`] gives the same figures back.
+pub fn write_rig(path: &Path, rig: &Rig) -> Result<(), CalibError> {
+    write_atomic(path, rig_text(rig).as_bytes()).map_err(|error| CalibError::Write { path: path.into(), error })
+}
+
+fn rig_text(rig: &Rig) -> String {
+    let mut text = String::new();
+    for c in &rig.cameras {
+        let name = Value::String(c.name.clone());
+        let rows: Vec<_> = (0..3).map(|r| list(c.matrix.row(r).iter())).collect();
+        let rotation = rotation::log(&UnitQuaternion::from_rotation_matrix(&c.camera_from_world));
+        // Writing into a String cannot fail.
+        let _ = writeln!(text, "[{}]\nname = {name}\nsize = [ {}, {} ]", key_text(&c.name), c.size_px[0], c.size_px[1]);
+        let _ = writeln!(text, "matrix = [ {} ]\ndistortions = {}", rows.join(", "), list(c.distortion.iter()));
+        let _ = writeln!(text, "rotation = {}\ntranslation = {}\nfisheye = false\n", list(rotation.iter()), list(c.translation.iter()));
+    }
+    let up = if rig.up == Up::Y { "y" } else { "z" };
+    text + &format!("[metadata]\nup = \"{up}\"\n")
+}
+
+/// A TOML key, quoted where it must be.
+fn key_text(name: &str) -> String {
+    let bare = !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-');
+    if bare { name.into() } else { Value::String(name.into()).to_string() }
+}
+
+/// A TOML list of the shortest decimals that read back as the same floats.
+fn list<'a>(numbers: impl Iterator<Item = &'a f64>) -> String {
+    format!("[ {} ]", numbers.map(|x| format!("{x:?}")).collect::<Vec<_>>().join(", "))
+}
+
+fn syntax_error(path: &Path, text: &str, error: &toml::de::Error) -> CalibError {
+    CalibError::Syntax { path: path.into(), message: toml_message(text, error) }
+}
+
+/// The parser's message in one line, with the line number.
+pub(super) fn toml_message(text: &str, error: &toml::de::Error) -> String {
+    let message = error.message().replace('\n', ", ");
+    match error.span().and_then(|span| text.get(..span.start)) {
+        Some(before) => format!("line {}: {message}", before.matches('\n').count() + 1),
+        None => message,
+    }
+}
+
+fn read_up(path: &Path, tables: &Table) -> Result<Up, CalibError> {
+    let wrong = || CalibError::WrongValue { path: path.into(), table: "metadata".into(), key: "up", expected: "\"y\" or \"z\"" };
+    match tables.get("metadata").and_then(|m| m.get("up")) {
+        None => Ok(Up::default()),
+        Some(value) => value.clone().try_into().map_err(|_| wrong()),
+    }
+}
+
+struct CameraTable<'a> {
+    path: &'a Path,
+    name: &'a str,
+    table: &'a Table,
+}
+
+impl CameraTable<'_> {
+    fn camera(&self) -> Result<Camera, CalibError> {
+        if self.table.get("fisheye").is_some_and(|v| v.as_bool() != Some(false)) {
+            return Err(CalibError::Fisheye { path: self.path.into(), table: self.name.into() });
+        }
+        let size = "two whole numbers, the width and height of the pictures in px";
+        let size_px = self.read("size", size, |v| {
+            let numbers = floats(v).filter(|n| n.len() == 2 && n.iter().all(|x| x.fract() == 0.0 && (1.0..1e6).contains(x)))?;
+            Some([numbers[0] as u32, numbers[1] as u32])
+        })?;
+        let matrix = self.read("matrix", "three rows of three numbers, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px", |v| {
+            let rows: Vec<_> = v.as_array()?.iter().map(floats).collect::<Option<_>>()?;
+            (rows.len() == 3 && rows.iter().all(|r| r.len() == 3)).then(|| Matrix3::from_row_iterator(rows.into_iter().flatten()))
+        })?;
+        let distortion = self.read("distortions", "4 or 5 numbers, k1, k2, p1, p2 (and k3)", |v| {
+            let mut terms = floats(v).filter(|n| n.len() == 4 || n.len() == 5)?;
+            terms.resize(5, 0.0);
+            terms.try_into().ok()
+        })?;
+        let three = |v: &Value| floats(v).filter(|n| n.len() == 3).map(Vector3::from_vec);
+        let rotation = self.read("rotation", "three numbers, a Rodrigues vector in radians", three)?;
+        let translation = self.read("translation", "three numbers in metres", three)?;
+        let camera_from_world = rotation::exp(&rotation).to_rotation_matrix();
+        Ok(Camera { name: self.name.into(), size_px, matrix, distortion, camera_from_world, translation })
+    }
+
+    fn read<T>(&self, key: &'static str, expected: &'static str, parse: impl Fn(&Value) -> Option<T>) -> Result<T, CalibError> {
+        let (path, table) = (self.path.to_path_buf(), self.name.to_string());
+        match self.table.get(key) {
+            None => Err(CalibError::MissingKey { path, table, key, expected }),
+            Some(value) => parse(value).ok_or(CalibError::WrongValue { path, table, key, expected }),
+        }
+    }
+}
+
+fn floats(value: &Value) -> Option<Vec<f64>> {
+    value.as_array()?.iter().map(|x| x.as_float().or_else(|| x.as_integer().map(|i| i as f64))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TWO_CAMERAS: &str = r#"
+[cam_10]
+size = [ 640.0, 480.0 ]
+matrix = [ [ 550, 0.0, 320.0 ], [ 0.0, 551.0, 240.0 ], [ 0.0, 0.0, 1.0 ] ]
+distortions = [ -0.08, 0.01, 0.001, 0.0 ]
+rotation = [ 1.6, 0.0, 0.0 ]
+translation = [ 0.0, 1.0, 0.0 ]
+
+[cam_2]
+name = "left"
+size = [ 640, 480 ]
+matrix = [ [ 550.0, 0.0, 320.0 ], [ 0.0, 551.0, 240.0 ], [ 0.0, 0.0, 1.0 ] ]
+distortions = [ -0.08, 0.01, 0.001, 0.0, 0.2 ]
+rotation = [ 1.6, 0.0, 0.0 ]
+translation = [ -0.3, 1.0, 0.0 ]
+fisheye = false
+
+[metadata]
+adjusted = false
+up = "y"
+"#;
+
+    fn read_text(text: &str) -> Result<Rig, CalibError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("Calib.toml");
+        std::fs::write(&path, text).unwrap();
+        read_rig(&path)
+    }
+
+    fn refusal(from: &str, to: &str) -> String {
+        assert!(TWO_CAMERAS.contains(from));
+        read_text(&TWO_CAMERAS.replace(from, to)).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn cameras_come_in_natural_order_with_four_or_five_distortion_terms() {
+        let rig = read_text(TWO_CAMERAS).unwrap();
+        let names: Vec<_> = rig.cameras.iter().map(|c| c.name.as_str()).collect();
+        assert_eq!(names, ["cam_2", "cam_10"]);
+        assert_eq!(rig.cameras[0].distortion, [-0.08, 0.01, 0.001, 0.0, 0.2]);
+        assert_eq!(rig.cameras[1].distortion, [-0.08, 0.01, 0.001, 0.0, 0.0]);
+        assert_eq!((rig.cameras[0].size_px, rig.up), ([640, 480], Up::Y));
+        assert_eq!(rig.cameras[1].matrix, Matrix3::new(550.0, 0.0, 320.0, 0.0, 551.0, 240.0, 0.0, 0.0, 1.0));
+        assert!((rig.baselines_m()[0].2 - 0.3).abs() < 1e-12);
+    }
+
+    #[test]
+    fn round_trip_keeps_every_figure() {
+        let mut rig = read_text(TWO_CAMERAS).unwrap();
+        rig.cameras[0].name = "gauche 1".into();
+        // Half a turn is where rotation vectors are hardest.
+        rig.cameras[0].camera_from_world = rotation::exp(&(Vector3::new(0.6, -0.48, 0.64) * 3.141_592)).to_rotation_matrix();
+        rig.cameras[1].distortion[4] = 1.0 / 3.0e9;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("out/Calib.toml");
+        write_rig(&path, &rig).unwrap();
+        let back = read_rig(&path).unwrap();
+        let order = [1, 0];
+        for (camera, from) in back.cameras.iter().zip(order) {
+            let expected = &rig.cameras[from];
+            assert!((camera.camera_from_world.matrix() - expected.camera_from_world.matrix()).norm() < 1e-9);
+            assert_eq!(&Camera { camera_from_world: expected.camera_from_world, ..camera.clone() }, expected);
+        }
+        assert_eq!(back.up, rig.up);
+    }
+
+    #[test]
+    fn refusals_name_the_table_and_the_key() {
+        let cases = [
+            ("size = [ 640, 480 ]", "", "[cam_2] has no `size`"),
+            ("size = [ 640, 480 ]", "size = [ 640.5, 480 ]", "[cam_2] `size` must be two whole numbers"),
+            ("rotation = [ 1.6, 0.0, 0.0 ]", "rotation = [ 1.6, 0.0 ]", "[cam_2] `rotation` must be three numbers"),
+            ("0.001, 0.0, 0.2 ]", "0.001 ]", "[cam_2] `distortions` must be 4 or 5 numbers"),
+            ("fisheye = false", "fisheye = true", "[cam_2] is a fisheye camera"),
+            ("[ 0.0, 551.0, 240.0 ], ", "", "`matrix` must be three rows"),
+            ("up = \"y\"", "up = \"x\"", "[metadata] `up` must be \"y\" or \"z\""),
+            ("name = \"left\"", "name = left", "is not TOML: line 10: "),
+            ("translation = [ -0.3,", "translation = [ -300.0,", "looks like millimetres; divide"),
+        ];
+        for (from, to, expected) in cases {
+            let message = refusal(from, to);
+            assert!(message.contains(expected) && message.contains("Calib.toml: ") && !message.contains('\n'), "{message}");
+        }
+        assert!(read_text("[metadata]\nup = \"z\"\n").unwrap_err().to_string().contains("has no camera table"));
+    }
+
+    #[test]
+    fn real_files_are_read() {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+        if !data.exists() {
+            println!("skipped: no {}", data.display());
+            return;
+        }
+        let wide = read_rig(&data.join("multicam/pose2sim-blender-examples/Pose2Sim_cameras.toml")).unwrap();
+        assert_eq!((wide.cameras.len(), wide.cameras[0].size_px), (4, [1088, 1920]));
+        assert!(wide.baselines_m().iter().all(|b| (2.8..6.8).contains(&b.2)));
+        assert!(matches!(wide.validate_stereo(), Err(RigError::ViewsApart { .. })));
+        let lab = read_rig(&data.join("footage/p02_run_lab/Calib.toml")).unwrap();
+        let expected_m = [0.3006, 0.3128, 0.3346];
+        assert!(lab.baselines_m().iter().zip(expected_m).all(|(b, expected)| (b.2 - expected).abs() < 1e-4));
+        assert_eq!(lab.validate_stereo(), Ok(()));
+    }
+}
