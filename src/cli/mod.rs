@@ -1,8 +1,12 @@
 //! One file per subcommand: load, call the library, save, report.
+
+mod progress;
+mod disparity;
 mod generate;
 mod model;
 mod motions;
-mod disparity;
+mod progress;
+mod render;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -19,19 +23,24 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Disparities of one rectified pair or triple of pictures
+    Disparity(disparity::DisparityArgs),
     /// Motion databases and their PCA models
     #[command(subcommand)]
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
-    /// Disparities of one rectified pair or triple of pictures
-    Disparity(disparity::DisparityArgs),
+    /// Phantom footage of a motion file before a rig, with its truth
+    Render(render::RenderArgs),
 }
 
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
+        Command::Disparity(args) => disparity::run(&args),
+        Command::Render(args) => render::run(&args),
+    }
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
     }
@@ -44,6 +53,4 @@ fn positive(text: &str) -> Result<f64, String> {
 /// A part of a whole, above 0 and up to 1.
 fn part(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or("must be above 0 and at most 1".into())
-        Command::Disparity(args) => disparity::run(&args),
-    }
 }

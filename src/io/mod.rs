@@ -2,8 +2,10 @@
 
 pub mod asf_amc;
 pub mod atomic;
+pub mod joints_csv;
 pub mod fit_json;
 pub mod pfm;
+pub mod ply;
 
 pub mod calib_toml;
 
@@ -11,7 +13,6 @@ pub mod images;
 
 pub mod session;
 
-pub mod video;
 pub mod bvh;
 pub mod manifest;
 pub mod mapping;
@@ -19,9 +20,8 @@ pub mod mocap;
 pub mod model_npz;
 pub mod mot;
 pub mod sidecar;
-pub mod manifest;
-pub mod model_npz;
 pub mod style_json;
+pub mod video;
 
 pub use atomic::write_atomic;
 pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};

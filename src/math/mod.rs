@@ -2,7 +2,8 @@
 
 pub mod arrow;
 pub mod banded;
-pub mod pca;
+pub mod curves;
+pub mod distance_field;
 pub mod curves;
 pub mod pca;
 pub mod rotation;
