@@ -28,8 +28,8 @@ pub struct Entry {
 
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
     #[error("{path} line 1 names no column `file`")]
     NoFileColumn { path: PathBuf },
     #[error("{path} line 1: unknown column `{column}`; known are file, subject, activity, speed_m_s, length_m, start_s, end_s")]
@@ -57,7 +57,7 @@ pub fn find_motions(inputs: &[PathBuf], manifest: Option<&Path>) -> Result<Vec<E
 }
 
 fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -> Result<(), ManifestError> {
-    let failed = |source| ManifestError::Read { path: path.to_path_buf(), source };
+    let failed = |cause| ManifestError::Read { path: path.to_path_buf(), cause };
     if !fs::metadata(path).map_err(failed)?.is_dir() {
         entries.push(plain(path));
         return Ok(());
@@ -87,7 +87,7 @@ fn plain(path: &Path) -> Entry {
 
 /// The rows of a `subjects.csv`.
 pub fn read_manifest(path: &Path) -> Result<Vec<Entry>, ManifestError> {
-    let text = fs::read_to_string(path).map_err(|source| ManifestError::Read { path: path.to_path_buf(), source })?;
+    let text = fs::read_to_string(path).map_err(|cause| ManifestError::Read { path: path.to_path_buf(), cause })?;
     let mut lines = text.trim_start_matches('\u{feff}').lines();
     let columns: Vec<String> = cells(lines.next().unwrap_or_default());
     let known = ["file", "subject", "activity", "speed_m_s", "length_m", "start_s", "end_s"];
