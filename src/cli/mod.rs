@@ -1,4 +1,5 @@
 //! One file per subcommand: load, call the library, save, report.
+mod clouds;
 mod disparity;
 
 use anyhow::Result;
@@ -16,6 +17,8 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// The person's point cloud in every frame of a session, as PLY files
+    Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
 }
@@ -24,6 +27,7 @@ enum Command {
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
+        Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
     }
 }
