@@ -4,8 +4,10 @@ pub mod clip;
 pub mod pose;
 pub mod shape;
 pub mod skeleton;
+pub mod surface;
 
 pub use clip::Clip;
 pub use pose::{Placement, Pose, place};
 pub use shape::{Length, Shape};
 pub use skeleton::{BALL_JOINTS, DOF, Joint, NODES};
+pub use surface::{PosedSurface, Surface};

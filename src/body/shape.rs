@@ -25,6 +25,18 @@ pub enum Length {
 
 impl Length {
     pub const COUNT: usize = 10;
+    pub const ALL: [Length; Length::COUNT] = [
+        Length::Pelvis,
+        Length::Thigh,
+        Length::Shank,
+        Length::Foot,
+        Length::Trunk,
+        Length::Head,
+        Length::Shoulders,
+        Length::UpperArm,
+        Length::Forearm,
+        Length::Hand,
+    ];
 
     /// The group that scales the segment from `joint`'s parent to `joint`.
     pub fn above(joint: Joint) -> Length {

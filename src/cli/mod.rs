@@ -1,5 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod clouds;
+
+mod progress;
 mod disparity;
 
 use anyhow::Result;

@@ -1,6 +1,8 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod asf_amc;
 pub mod atomic;
+pub mod fit_json;
 pub mod pfm;
 pub mod ply;
 
@@ -10,6 +12,15 @@ pub mod images;
 
 pub mod session;
 
+pub mod bvh;
+pub mod manifest;
+pub mod mapping;
+pub mod mocap;
+pub mod model_npz;
+pub mod mot;
+pub mod sidecar;
+pub mod style_json;
 pub mod video;
 
 pub use atomic::write_atomic;
+pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};

@@ -1,3 +1,9 @@
 //! Numerics that know no camera and no body.
 
+pub mod arrow;
+pub mod banded;
+pub mod curves;
+pub mod distance_field;
+pub mod pca;
 pub mod rotation;
+pub mod spline;

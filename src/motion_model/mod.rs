@@ -1,7 +1,13 @@
 //! Motion models: cycles cut from clips, the database, PCA by motion parameter (speed or jump length).
 
+pub mod cadence;
 pub mod cycle;
+pub mod database;
 pub mod model;
+pub mod segment;
+pub mod synthetic;
 
-pub use cycle::{Activity, Cycle, ROOT_CHANNELS, SAMPLES};
-pub use model::{Member, Model};
+pub use cadence::CadenceLaw;
+pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
+pub use model::{Member, Model, ModelError};
+pub use segment::{Label, Segments, segment};

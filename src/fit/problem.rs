@@ -1,0 +1,744 @@
+//! Distances of cloud points and silhouette rays to the skin, priors and smoothness as one arrow-structured problem.
+//!
+//! cost = ½ Σ_i ω_i r_i² + ½ Σ α_i²/λ_i + ½ (ln s/s_0)²/σ_s² + ½ Σ (ℓ−1)²/σ_ℓ² + ½ Σ (w−1)²/σ_w²
+//!      + ½ Σ_t (|g̈|²/σ_a² + |ω̇|²/σ_ω² + μ̈²/σ_μ² + tilt²/σ_t²).                                               (1)
+//! r_i is equation (2) of body::surface with κ_i = 1/|∇√d_eff| frozen, ω_i a frozen Cauchy weight over the variance of the
+//! point along the normal; both are refreshed between solver runs, because a step built on frozen weights but judged by
+//! the robust cost is rejected for ever. A silhouette ray counts as the point of the ray nearest to the skin; that point is
+//! frozen too (envelope theorem: its motion along the ray changes the distance in second order only).
+//! A primitive's centre that projects outside a silhouette counts with its distance to it, else nothing would hold back
+//! limbs that reach where no point is.
+//! Stereo sees front sides: a point where the skin faces away from the cameras has weight zero.
+//! Checked against central differences for every kind of unknown.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use rayon::prelude::*;
+
+use super::curve::Curve;
+use super::state::{LOCAL, Motion, SharedLayout, State};
+use crate::body::surface::{Evaluation, SKIN};
+use crate::body::{Length, NODES, PosedSurface};
+use crate::math::arrow::{ArrowProblem, NormalEquations};
+use crate::math::distance_field::DistanceField;
+use crate::math::rotation::{hat, left_jacobian, log};
+use crate::rig::Camera;
+
+/// One measurement of the skin.
+#[derive(Clone, Debug)]
+pub enum Target {
+    /// A cloud point on the skin, with its covariance, m².
+    Point { x: Vector3<f64>, covariance: Matrix3<f64> },
+    /// A ray that grazes the body; the blur of the outline is `sigma` radians wide.
+    Ray { origin: Vector3<f64>, direction: Vector3<f64>, sigma: f64 },
+}
+
+/// The distance to a silhouette in one camera's picture.
+#[derive(Clone, Debug)]
+pub struct Outside {
+    pub camera: Camera,
+    /// Pixels.
+    pub field: DistanceField,
+}
+
+/// What one frame shows.
+#[derive(Clone, Debug, Default)]
+pub struct Frame {
+    pub time_s: f64,
+    pub targets: Vec<Target>,
+    pub outsides: Arc<Vec<Outside>>,
+}
+
+/// Standard deviations and weights of equation (1).
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Difference between the person's skin and the model's, m; large at the start so that far points pull.
+    pub model_m: f64,
+    /// Share of a cloud point that is new information: neighbours share their correlation window.
+    pub point_weight: f64,
+    pub ray_weight: f64,
+    /// Of a primitive outside a silhouette.
+    pub outside_weight: f64,
+    pub acceleration: f64,
+    pub angular_acceleration: f64,
+    pub phase_acceleration: f64,
+    /// Lean of the carrier against the vertical, rad.
+    pub tilt: f64,
+    pub stature: f64,
+    pub length: f64,
+    pub arm_length: f64,
+    pub width: f64,
+}
+
+/// What is known before the fit.
+#[derive(Clone, Copy, Debug)]
+pub struct Known {
+    /// Centre of the cameras, metres.
+    pub viewpoint: Vector3<f64>,
+    pub up: Vector3<f64>,
+    /// Expected stature, metres.
+    pub stature_m: f64,
+}
+
+/// Which unknowns may move.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Free {
+    pub rotation: bool,
+    pub phase: bool,
+    pub weights: bool,
+    pub stature: bool,
+    pub lengths: bool,
+    pub widths: bool,
+}
+
+/// Frozen quantities of one target.
+#[derive(Clone, Copy, Debug, Default)]
+struct Frozen {
+    x: Vector3<f64>,
+    /// ω_i.
+    weight: f64,
+    /// κ_i.
+    metres_per_root: f64,
+}
+
+/// The problem at one set of frozen weights.
+pub struct Problem<'a> {
+    pub curve: &'a Curve,
+    pub frames: &'a [Frame],
+    pub settings: &'a Settings,
+    pub free: Free,
+    pub known: &'a Known,
+    frozen: Vec<Vec<Frozen>>,
+    /// Per frame, outside and primitive.
+    frozen_outsides: Vec<Vec<FrozenOutside>>,
+}
+
+/// Frozen quantities of one primitive in one silhouette's picture.
+#[derive(Clone, Copy, Debug, Default)]
+struct FrozenOutside {
+    weight: f64,
+    /// Depth over focal length.
+    metres_per_px: f64,
+}
+
+/// Scale of the Cauchy loss in standard deviations: 95 % efficiency for Gaussian noise.
+const CAUCHY: f64 = 2.385;
+/// The same for silhouettes: a limb far outside is a hole in the mask less often than a limb out of place.
+const OUTSIDE_CAUCHY: f64 = 6.0;
+/// Skin whose outward normal makes a larger cosine than this with the line of sight is not seen.
+const FACING: f64 = 0.2;
+/// Primitives that a ray passes nearest to, tried as the start of its closest approach.
+const CANDIDATES: usize = 6;
+/// Added to the distance of a point that only the far side of the body explains.
+const BEHIND_M: f64 = 0.1;
+
+/// How well a state explains the targets, robustly.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Fitness {
+    /// Σ ω ½c² ln(1 + (r/cσ)²) over the targets, without priors.
+    pub cost: f64,
+    pub points: usize,
+    /// Sum of squared distances of points within 3 σ, m², and their number.
+    pub inlier_square: f64,
+    pub inliers: usize,
+    /// Effective number of measurements: sum of weights relative to a full-weight target.
+    pub effective: f64,
+}
+
+impl Fitness {
+    fn add(self, other: Fitness) -> Fitness {
+        Fitness {
+            cost: self.cost + other.cost,
+            points: self.points + other.points,
+            inlier_square: self.inlier_square + other.inlier_square,
+            inliers: self.inliers + other.inliers,
+            effective: self.effective + other.effective,
+        }
+    }
+}
+
+impl<'a> Problem<'a> {
+    pub fn new(curve: &'a Curve, frames: &'a [Frame], settings: &'a Settings, free: Free, known: &'a Known, state: &State) -> Problem<'a> {
+        let (frozen, frozen_outsides) = (0..frames.len())
+            .into_par_iter()
+            .map(|t| {
+                let surface = state.posed(curve, t).surface;
+                (freeze(&frames[t], &surface, settings, &known.viewpoint).0, freeze_outsides(&frames[t], &surface, settings).0)
+            })
+            .unzip();
+        Problem { curve, frames, settings, free, known, frozen, frozen_outsides }
+    }
+
+    /// Distance of primitive `index` outside a silhouette, metres, and its row.
+    fn outside_row(
+        motion: &Motion,
+        state: &State,
+        frame: usize,
+        index: usize,
+        outside: &Outside,
+        frozen: &FrozenOutside,
+        row: &mut [f64],
+    ) -> f64 {
+        let p = &motion.surface.primitives[index];
+        row.fill(0.0);
+        let Some((pixel, jacobian)) = outside.camera.project_with_jacobian(&p.centre) else { return 0.0 };
+        let (distance, gradient) = outside.field.at(pixel.x, pixel.y);
+        let pull = jacobian.transpose() * nalgebra::Vector2::from(gradient) * frozen.metres_per_px;
+        let layout = state.layout();
+        let moment = p.centre.cross(&pull);
+        let wrench = [pull.x, pull.y, pull.z, moment.x, moment.y, moment.z];
+        for (column, entry) in motion.twists[p.node as usize].column_iter().zip(row.iter_mut()) {
+            *entry += (0..6).map(|i| wrench[i] * column[i]).sum::<f64>();
+        }
+        row[LOCAL + layout.stature()] += pull.dot(&(p.centre - state.carriers[frame].position));
+        row[LOCAL + layout.length(p.limb)] += pull.dot(&p.length_velocity(&Vector3::zeros(), state.shape.lengths[p.limb as usize]));
+        distance * frozen.metres_per_px
+    }
+
+    /// Residual κ(√d_eff − √d_0) and its row for the unknowns of the frame and the shared ones.
+    fn residual_row(motion: &Motion, state: &State, frame: usize, frozen: &Frozen, scratch: &mut Scratch) -> f64 {
+        let surface = &motion.surface;
+        surface.evaluate_into(&frozen.x, &mut scratch.evaluation);
+        let e = &scratch.evaluation;
+        let root = e.root();
+        let factor = -frozen.metres_per_root * e.root_slope();
+        let layout = state.layout();
+        scratch.row.fill(0.0);
+        scratch.wrench.iter_mut().for_each(|w| *w = None);
+        let mut force = Vector3::zeros();
+        for share in &e.shares {
+            let p = &surface.primitives[share.primitive];
+            force += share.force;
+            *scratch.wrench[p.node as usize].get_or_insert_with(Vector3::zeros) += share.force;
+            let limb = p.limb as usize;
+            let (length, width) = (state.shape.lengths[limb], state.shape.widths[limb]);
+            scratch.row[LOCAL + layout.length(p.limb)] += share.force.dot(&p.length_velocity(&share.unit, length));
+            scratch.row[LOCAL + layout.width(p.limb)] += share.force.dot(&p.width_velocity(&share.unit, width));
+        }
+        for (node, twist) in motion.twists.iter().enumerate() {
+            if let Some(f) = scratch.wrench[node] {
+                let moment = frozen.x.cross(&f);
+                let wrench = [f.x, f.y, f.z, moment.x, moment.y, moment.z];
+                for (column, entry) in twist.column_iter().zip(scratch.row.iter_mut()) {
+                    *entry += (0..6).map(|i| wrench[i] * column[i]).sum::<f64>();
+                }
+            }
+        }
+        scratch.row[LOCAL + layout.stature()] += force.dot(&(frozen.x - state.carriers[frame].position));
+        scratch.row.iter_mut().for_each(|entry| *entry *= factor);
+        frozen.metres_per_root * (root - SKIN.sqrt())
+    }
+
+    fn frame_normal(&self, state: &State, frame: usize) -> FrameNormal {
+        let size = LOCAL + state.layout().size();
+        let motion = state.motion(self.curve, frame);
+        let mut scratch = Scratch::new(size);
+        let mut normal = FrameNormal { cost: 0.0, hessian: vec![0.0; size * size], gradient: vec![0.0; size] };
+        for frozen in self.frozen[frame].iter().filter(|f| f.weight > 0.0) {
+            let residual = Self::residual_row(&motion, state, frame, frozen, &mut scratch);
+            normal.add(residual, frozen.weight, &scratch.row);
+        }
+        for (outside, frozen) in self.outsides(frame) {
+            for (index, frozen) in frozen.iter().enumerate() {
+                let residual = Self::outside_row(&motion, state, frame, index, outside, frozen, &mut scratch.row);
+                if residual > 0.0 {
+                    normal.add(residual, frozen.weight, &scratch.row);
+                }
+            }
+        }
+        normal
+    }
+
+    /// The silhouettes of a frame with their frozen quantities, one per primitive.
+    fn outsides(&self, frame: usize) -> impl Iterator<Item = (&Outside, &[FrozenOutside])> {
+        let outsides = &self.frames[frame].outsides;
+        let frozen = &self.frozen_outsides[frame];
+        let each = frozen.len() / outsides.len().max(1);
+        outsides.iter().zip(frozen.chunks(each.max(1)))
+    }
+
+    fn frame_cost(&self, state: &State, frame: usize) -> f64 {
+        let posed = state.posed(self.curve, frame);
+        let mut evaluation = Evaluation::default();
+        let squares = self.frozen[frame].iter().filter(|f| f.weight > 0.0).map(|f| {
+            posed.surface.evaluate_into(&f.x, &mut evaluation);
+            let r = f.metres_per_root * (evaluation.root() - SKIN.sqrt());
+            0.5 * f.weight * r * r
+        });
+        let points: f64 = squares.sum();
+        let outside = self.outsides(frame).flat_map(|(outside, frozen)| {
+            posed
+                .surface
+                .primitives
+                .iter()
+                .zip(frozen)
+                .map(|(p, f)| 0.5 * f.weight * (outside_px(outside, &p.centre) * f.metres_per_px).powi(2))
+        });
+        points + outside.sum::<f64>()
+    }
+
+    /// Residuals of the shared priors: index into z, value, derivative.
+    fn shared_priors(&self, state: &State) -> Vec<(usize, f64, f64)> {
+        let layout = state.layout();
+        let s = self.settings;
+        let mut priors: Vec<_> = state
+            .weights
+            .iter()
+            .zip(&self.curve.eigenvalues)
+            .enumerate()
+            .map(|(i, (a, lambda))| (i, a / lambda.sqrt(), 1.0 / lambda.sqrt()))
+            .collect();
+        priors.push((layout.stature(), (state.shape.stature_m / self.known.stature_m).ln() / s.stature, 1.0 / s.stature));
+        for i in 0..Length::COUNT {
+            let arm = [Length::Shoulders, Length::UpperArm, Length::Forearm, Length::Hand].iter().any(|l| *l as usize == i);
+            let sigma = if arm { s.arm_length } else { s.length };
+            priors.push((layout.weights + 1 + i, (state.shape.lengths[i] - 1.0) / sigma, 1.0 / sigma));
+            priors.push((layout.weights + 1 + Length::COUNT + i, (state.shape.widths[i] - 1.0) / s.width, 1.0 / s.width));
+        }
+        priors
+    }
+
+    /// Residuals that tie frames together: value and (index into y, derivative) pairs.
+    fn local_priors(&self, state: &State) -> Vec<(f64, Vec<(usize, f64)>)> {
+        let mut priors = Vec::new();
+        let c = &state.carriers;
+        let tilt = self.settings.tilt * (c.len() as f64).sqrt();
+        for (t, carrier) in c.iter().enumerate() {
+            let up_in_carrier = carrier.world_from_carrier.inverse() * self.known.up;
+            let slope = carrier.world_from_carrier.inverse().to_rotation_matrix().into_inner() * hat(&self.known.up);
+            for axis in [0, 2] {
+                let row = (0..3).map(|k| (LOCAL * t + k, slope[(axis, k)] / tilt)).collect();
+                priors.push((up_in_carrier[axis] / tilt, row));
+            }
+        }
+        for t in 1..c.len().saturating_sub(1) {
+            let before = self.frames[t].time_s - self.frames[t - 1].time_s;
+            let after = self.frames[t + 1].time_s - self.frames[t].time_s;
+            let mid = 0.5 * (before + after);
+            let (p, n) = (1.0 / (before * mid), 1.0 / (after * mid));
+            let second = |previous: f64, now: f64, next: f64| previous * p + next * n - now * (p + n);
+            let stencil = |offset: usize, sigma: f64| {
+                vec![(LOCAL * (t - 1) + offset, p / sigma), (LOCAL * t + offset, -(p + n) / sigma), (LOCAL * (t + 1) + offset, n / sigma)]
+            };
+            for axis in 0..3 {
+                let value = second(c[t - 1].position[axis], c[t].position[axis], c[t + 1].position[axis]);
+                priors.push((value / self.settings.acceleration, stencil(3 + axis, self.settings.acceleration)));
+            }
+            let value = second(c[t - 1].phase, c[t].phase, c[t + 1].phase);
+            priors.push((value / self.settings.phase_acceleration, stencil(6, self.settings.phase_acceleration)));
+            priors.extend(self.turn_priors(state, t, p, n));
+        }
+        priors
+    }
+
+    /// Angular acceleration n log(R_{t+1} R_tᵀ) + p log(R_{t−1} R_tᵀ) over its sigma, by axis.
+    fn turn_priors(&self, state: &State, t: usize, p: f64, n: f64) -> Vec<(f64, Vec<(usize, f64)>)> {
+        let c = &state.carriers;
+        let now = c[t].world_from_carrier.inverse();
+        let (to_next, to_previous) = (log(&(c[t + 1].world_from_carrier * now)), log(&(c[t - 1].world_from_carrier * now)));
+        // d log(exp(δ) R) = J_l⁻¹ δ and d log(R exp(−δ)) = −J_r⁻¹ δ with J_r(v) = J_l(−v); J_l is regular below 2π.
+        let inverse = |v: Vector3<f64>| left_jacobian(&v).try_inverse().unwrap_or_else(Matrix3::identity);
+        let sigma = self.settings.angular_acceleration;
+        let value = (to_next * n + to_previous * p) / sigma;
+        let next = inverse(to_next) * (n / sigma);
+        let previous = inverse(to_previous) * (p / sigma);
+        let middle = -(inverse(-to_next) * (n / sigma) + inverse(-to_previous) * (p / sigma));
+        let row = |axis: usize| {
+            [(t - 1, &previous), (t, &middle), (t + 1, &next)]
+                .iter()
+                .flat_map(|(f, m)| (0..3).map(move |k| (LOCAL * f + k, m[(axis, k)])))
+                .collect()
+        };
+        (0..3).map(|axis| (value[axis], row(axis))).collect()
+    }
+
+    fn pin(&self, normal: &mut NormalEquations, layout: SharedLayout) {
+        let frozen_local = |k: usize| (k < 3 && !self.free.rotation) || (k == 6 && !self.free.phase);
+        for i in 0..normal.local.size() {
+            if frozen_local(i % LOCAL) {
+                normal.local.isolate(i);
+                normal.border.row_mut(i).fill(0.0);
+                normal.local_gradient[i] = 0.0;
+            }
+        }
+        for i in 0..layout.size() {
+            let free = if i < layout.weights {
+                self.free.weights
+            } else if i == layout.stature() {
+                self.free.stature
+            } else if i < layout.width(Length::Pelvis) {
+                self.free.lengths
+            } else {
+                self.free.widths
+            };
+            if !free {
+                normal.shared.row_mut(i).fill(0.0);
+                normal.shared.column_mut(i).fill(0.0);
+                normal.shared[(i, i)] = 1.0;
+                normal.border.column_mut(i).fill(0.0);
+                normal.shared_gradient[i] = 0.0;
+            }
+        }
+    }
+}
+
+struct FrameNormal {
+    cost: f64,
+    /// Lower half, row-major.
+    hessian: Vec<f64>,
+    gradient: Vec<f64>,
+}
+
+impl FrameNormal {
+    fn add(&mut self, residual: f64, weight: f64, row: &[f64]) {
+        let size = row.len();
+        self.cost += 0.5 * weight * residual * residual;
+        for (i, a) in row.iter().enumerate() {
+            if *a != 0.0 {
+                let scaled = a * weight;
+                self.gradient[i] += scaled * residual;
+                for (entry, b) in self.hessian[i * size..=i * size + i].iter_mut().zip(row) {
+                    *entry += scaled * b;
+                }
+            }
+        }
+    }
+
+    fn scatter(&self, frame: usize, normal: &mut NormalEquations) {
+        let size = self.gradient.len();
+        normal.cost += self.cost;
+        for i in 0..size {
+            for j in 0..=i {
+                let value = self.hessian[i * size + j];
+                match (i < LOCAL, j < LOCAL) {
+                    (true, _) => normal.local.add(LOCAL * frame + i, LOCAL * frame + j, value),
+                    (false, true) => normal.border[(LOCAL * frame + j, i - LOCAL)] += value,
+                    (false, false) => {
+                        normal.shared[(i - LOCAL, j - LOCAL)] += value;
+                        if i != j {
+                            normal.shared[(j - LOCAL, i - LOCAL)] += value;
+                        }
+                    }
+                }
+            }
+            if i < LOCAL {
+                normal.local_gradient[LOCAL * frame + i] += self.gradient[i];
+            } else {
+                normal.shared_gradient[i - LOCAL] += self.gradient[i];
+            }
+        }
+    }
+}
+
+struct Scratch {
+    evaluation: Evaluation,
+    row: Vec<f64>,
+    wrench: [Option<Vector3<f64>>; NODES],
+}
+
+impl Scratch {
+    fn new(size: usize) -> Scratch {
+        Scratch { evaluation: Evaluation::default(), row: vec![0.0; size], wrench: [None; NODES] }
+    }
+}
+
+impl ArrowProblem for Problem<'_> {
+    type State = State;
+
+    fn cost(&self, state: &State) -> f64 {
+        let frames: Vec<f64> = (0..self.frames.len()).into_par_iter().map(|t| self.frame_cost(state, t)).collect();
+        let shared: f64 = self.shared_priors(state).iter().map(|(_, r, _)| r * r).sum();
+        let local: f64 = self.local_priors(state).iter().map(|(r, _)| r * r).sum();
+        frames.iter().sum::<f64>() + 0.5 * (shared + local)
+    }
+
+    fn linearise(&self, state: &State) -> NormalEquations {
+        let frames: Vec<FrameNormal> = (0..self.frames.len()).into_par_iter().map(|t| self.frame_normal(state, t)).collect();
+        let mut normal = NormalEquations::zeros(LOCAL * frames.len(), 3 * LOCAL - 1, state.layout().size());
+        for (t, frame) in frames.iter().enumerate() {
+            frame.scatter(t, &mut normal);
+        }
+        for (i, r, slope) in self.shared_priors(state) {
+            normal.cost += 0.5 * r * r;
+            normal.shared[(i, i)] += slope * slope;
+            normal.shared_gradient[i] += slope * r;
+        }
+        for (r, row) in self.local_priors(state) {
+            normal.cost += 0.5 * r * r;
+            for (i, a) in &row {
+                normal.local_gradient[*i] += a * r;
+                for (j, b) in row.iter().filter(|(j, _)| j <= i) {
+                    normal.local.add(*i, *j, a * b);
+                }
+            }
+        }
+        self.pin(&mut normal, state.layout());
+        normal
+    }
+
+    fn retract(&self, state: &State, y: &DVector<f64>, z: &DVector<f64>) -> State {
+        state.moved(y.as_slice(), z.as_slice())
+    }
+}
+
+/// Frozen weights of one frame at a posed surface, and how well it fits.
+fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings, viewpoint: &Vector3<f64>) -> (Vec<Frozen>, Fitness) {
+    let mut evaluation = Evaluation::default();
+    let mut fitness = Fitness::default();
+    let frozen = frame.targets.iter().map(|target| {
+        let (x, base) = match target {
+            Target::Point { x, .. } => (*x, settings.point_weight),
+            Target::Ray { origin, direction, .. } => (closest_on_ray(surface, origin, direction, &mut evaluation), settings.ray_weight),
+        };
+        surface.evaluate_into(&x, &mut evaluation);
+        let normal = evaluation.gradient.normalize();
+        let (variance, hidden) = match target {
+            Target::Point { covariance, .. } => (normal.dot(&(covariance * normal)), normal.dot(&(x - viewpoint).normalize()) > FACING),
+            Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), false),
+        };
+        let precision = 1.0 / (variance + settings.model_m * settings.model_m);
+        let distance = evaluation.distance().abs() + if hidden { BEHIND_M } else { 0.0 };
+        let scaled = distance * distance * precision / (CAUCHY * CAUCHY);
+        let robust = if hidden { 0.0 } else { 1.0 / (1.0 + scaled) };
+        fitness.cost += base * 0.5 * CAUCHY * CAUCHY * scaled.ln_1p();
+        fitness.points += 1;
+        fitness.effective += base * robust;
+        if distance * distance * precision < 9.0 && matches!(target, Target::Point { .. }) {
+            fitness.inliers += 1;
+            fitness.inlier_square += distance * distance;
+        }
+        Frozen { x, weight: base * robust * precision, metres_per_root: evaluation.metres_per_root() }
+    });
+    (frozen.collect(), fitness)
+}
+
+fn outside_px(outside: &Outside, x: &Vector3<f64>) -> f64 {
+    outside.camera.project(x).map_or(0.0, |pixel| outside.field.at(pixel.x, pixel.y).0)
+}
+
+/// Frozen quantities of the primitives in a frame's silhouettes, and their robust cost.
+fn freeze_outsides(frame: &Frame, surface: &PosedSurface, settings: &Settings) -> (Vec<FrozenOutside>, f64) {
+    let mut cost = 0.0;
+    let precision = 1.0 / (settings.model_m * settings.model_m);
+    let frozen = frame.outsides.iter().flat_map(|o| surface.primitives.iter().map(move |p| (o, p))).map(|(outside, p)| {
+        let metres_per_px = outside.camera.camera_point(&p.centre).z / outside.camera.matrix[(0, 0)];
+        let scaled = (outside_px(outside, &p.centre) * metres_per_px).powi(2) * precision / (OUTSIDE_CAUCHY * OUTSIDE_CAUCHY);
+        cost += settings.outside_weight * 0.5 * OUTSIDE_CAUCHY * OUTSIDE_CAUCHY * scaled.ln_1p();
+        FrozenOutside { weight: settings.outside_weight * precision / (1.0 + scaled), metres_per_px }
+    });
+    (frozen.collect(), cost)
+}
+
+/// Robust fitness of each frame at a state.
+pub fn fitness(curve: &Curve, frames: &[Frame], settings: &Settings, viewpoint: &Vector3<f64>, state: &State) -> Vec<Fitness> {
+    let of_frame = |t: usize| {
+        let surface = state.posed(curve, t).surface;
+        let points = freeze(&frames[t], &surface, settings, viewpoint).1;
+        Fitness { cost: points.cost + freeze_outsides(&frames[t], &surface, settings).1, ..points }
+    };
+    (0..frames.len()).into_par_iter().map(of_frame).collect()
+}
+
+/// Sum over frames, in their order.
+pub fn total(fitness: &[Fitness]) -> Fitness {
+    fitness.iter().fold(Fitness::default(), |sum, f| sum.add(*f))
+}
+
+/// The point of a ray nearest to the skin: least d_eff among the closest approaches to the primitives, then refined.
+fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
+    let mut approaches: Vec<(f64, f64)> = surface
+        .primitives
+        .iter()
+        .map(|p| {
+            let (o, d) = (p.unit_from_world * (origin - p.centre), p.unit_from_world * direction);
+            let along = -o.dot(&d) / d.norm_squared();
+            ((o + d * along).norm_squared(), along)
+        })
+        .collect();
+    approaches.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut best = (f64::INFINITY, 0.0);
+    for (_, along) in approaches.iter().take(CANDIDATES) {
+        surface.evaluate_into(&(origin + direction * *along), evaluation);
+        if evaluation.d_eff < best.0 {
+            best = (evaluation.d_eff, *along);
+        }
+    }
+    // Near one primitive d_eff is a parabola along the ray; three secant steps on its slope settle the blend.
+    let mut along = best.1;
+    for _ in 0..3 {
+        let h = 2e-3;
+        let mut slope = |s: f64| {
+            surface.evaluate_into(&(origin + direction * s), evaluation);
+            evaluation.gradient.dot(direction)
+        };
+        let (before, after) = (slope(along - h), slope(along + h));
+        let curvature = (after - before) / (2.0 * h);
+        if curvature <= 0.0 {
+            break;
+        }
+        along -= (0.5 * (before + after) / curvature).clamp(-0.03, 0.03);
+    }
+    origin + direction * along
+}
+
+/// Covariance of the shared unknowns and variances of the local ones at a solution, from equation (1) of math::arrow.
+pub fn uncertainty(problem: &Problem, state: &State) -> Option<(DMatrix<f64>, DVector<f64>)> {
+    let normal = problem.linearise(state);
+    Some((normal.shared_covariance()?, normal.local_variances()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::Shape;
+    use crate::fit::curve::tests::made_up_model;
+    use crate::fit::state::Carrier;
+    use crate::math::rotation::exp;
+
+    const SETTINGS: Settings = Settings {
+        model_m: 0.03,
+        point_weight: 0.1,
+        ray_weight: 0.1,
+        outside_weight: 0.3,
+        acceleration: 1.0,
+        angular_acceleration: 4.0,
+        phase_acceleration: 1.0,
+        tilt: 0.1,
+        stature: 0.05,
+        length: 0.03,
+        arm_length: 0.06,
+        width: 0.1,
+    };
+    const KNOWN: Known = Known { viewpoint: Vector3::new(0.1, 0.0, 1.0), up: Vector3::new(0.0, 0.0, 1.0), stature_m: 1.75 };
+    const ALL: Free = Free { rotation: true, phase: true, weights: true, stature: true, lengths: true, widths: true };
+
+    fn state() -> State {
+        let mut shape = Shape::template(1.7);
+        shape.lengths = std::array::from_fn(|i| 1.0 + 0.05 * (i as f64).sin());
+        shape.widths = std::array::from_fn(|i| 1.0 + 0.08 * (2.0 * i as f64).cos());
+        let carriers = (0..3).map(|t| Carrier {
+            position: Vector3::new(0.3 + 0.04 * t as f64, 3.0 - 0.01 * (t * t) as f64, 0.9),
+            world_from_carrier: exp(&Vector3::new(1.5, 0.1 * t as f64, 0.2 + 0.03 * (t * t) as f64)),
+            phase: 0.21 + 0.033 * t as f64 + 0.004 * (t * t) as f64,
+        });
+        State { carriers: carriers.collect(), weights: vec![2.0, -1.5, 0.7], shape }
+    }
+
+    /// Points around the skin and rays past it.
+    fn frames(curve: &Curve, state: &State) -> Vec<Frame> {
+        (0..3)
+            .map(|t| {
+                let surface = state.posed(curve, t).surface;
+                let targets = surface.primitives.iter().enumerate().map(|(i, p)| {
+                    let aside = Vector3::new((i as f64).sin(), (1.7 * i as f64).cos(), (0.6 * i as f64).sin()) * 0.12;
+                    let x = p.centre + aside;
+                    if i % 3 == 0 {
+                        let origin = Vector3::new(0.1, 0.0, 1.0);
+                        Target::Ray { origin, direction: (x - origin).normalize(), sigma: 0.002 }
+                    } else {
+                        Target::Point { x, covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 4e-4, 1e-4)) }
+                    }
+                });
+                // A silhouette that half of the body is outside of, seen by a distorted camera at the world's origin.
+                let camera = Camera {
+                    name: "test".into(),
+                    size_px: [640, 480],
+                    matrix: Matrix3::new(550.0, 0.0, 320.0, 0.0, 545.0, 240.0, 0.0, 0.0, 1.0),
+                    distortion: [-0.08, 0.01, 1e-3, -5e-4, 0.0],
+                    camera_from_world: nalgebra::Rotation3::new(Vector3::new(1.62, -0.01, 0.02)),
+                    translation: Vector3::new(0.02, 0.95, 0.05),
+                };
+                let field = DistanceField::new(640, 480, 2, |x, y| x * 3 + y < 1200);
+                Frame { time_s: [0.0, 0.033, 0.1][t], targets: targets.collect(), outsides: Arc::new(vec![Outside { camera, field }]) }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn gradient_of_every_unknown_matches_central_differences() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let frames = frames(&curve, &state);
+        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
+        let normal = problem.linearise(&state);
+        assert!((normal.cost - problem.cost(&state)).abs() < 1e-9 * normal.cost);
+        assert!(freeze_outsides(&frames[1], &state.posed(&curve, 1).surface, &SETTINGS).1 > 1.0, "the silhouette must matter");
+        let (locals, shareds) = (normal.local_gradient.len(), normal.shared_gradient.len());
+        for i in 0..locals + shareds {
+            let at = |h: f64| {
+                let mut step = vec![0.0; locals + shareds];
+                step[i] = h;
+                problem.cost(&state.moved(&step[..locals], &step[locals..]))
+            };
+            let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
+            let analytic = if i < locals { normal.local_gradient[i] } else { normal.shared_gradient[i - locals] };
+            assert!(
+                (numeric - analytic).abs() < 1e-5 * (1.0 + numeric.abs()),
+                "unknown {i} of {locals} + {shareds}: {numeric} against {analytic}"
+            );
+        }
+    }
+
+    #[test]
+    fn rows_of_every_residual_match_central_differences() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let frames = frames(&curve, &state);
+        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
+        let size = LOCAL + state.layout().size();
+        let mut scratch = Scratch::new(size);
+        let motion = state.motion(&curve, 1);
+        for frozen in &problem.frozen[1] {
+            Problem::residual_row(&motion, &state, 1, frozen, &mut scratch);
+            let row = scratch.row.clone();
+            for (i, analytic) in row.iter().enumerate() {
+                let at = |h: f64| {
+                    let (mut y, mut z) = (vec![0.0; 3 * LOCAL], vec![0.0; state.layout().size()]);
+                    if i < LOCAL {
+                        y[LOCAL + i] = h
+                    } else {
+                        z[i - LOCAL] = h
+                    }
+                    let moved = state.moved(&y, &z);
+                    let root = moved.posed(&curve, 1).surface.evaluate(&frozen.x).root();
+                    frozen.metres_per_root * (root - SKIN.sqrt())
+                };
+                let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
+                // Primitives crossing the threshold of negligible weight leave a trace of e⁻¹⁰.
+                assert!((numeric - analytic).abs() < 2e-4 * (0.1 + numeric.abs()), "unknown {i}: {numeric} against {analytic}");
+            }
+        }
+    }
+
+    #[test]
+    fn ray_point_is_the_least_of_a_dense_search() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let surface = state.posed(&curve, 0).surface;
+        for target in &frames(&curve, &state)[0].targets {
+            if let Target::Ray { origin, direction, .. } = target {
+                let found = closest_on_ray(&surface, origin, direction, &mut Evaluation::default());
+                let dense =
+                    (0..8000).map(|i| surface.evaluate(&(origin + direction * (i as f64 * 1e-3))).d_eff).fold(f64::INFINITY, f64::min);
+                assert!(surface.evaluate(&found).d_eff < dense + 0.02, "{} {dense}", surface.evaluate(&found).d_eff);
+            }
+        }
+    }
+
+    #[test]
+    fn pinned_unknowns_do_not_move() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let frames = frames(&curve, &state);
+        let free = Free { weights: true, ..Free::default() };
+        let problem = Problem::new(&curve, &frames, &SETTINGS, free, &KNOWN, &state);
+        let (y, z) = problem.linearise(&state).step(0.1).unwrap();
+        assert!(y.iter().enumerate().all(|(i, v)| (3..6).contains(&(i % LOCAL)) || *v == 0.0));
+        assert!(z.rows(0, 3).amax() > 0.0 && z.rows(3, z.len() - 3).amax() == 0.0);
+    }
+}

@@ -1,0 +1,113 @@
+//! `fit.json`: how a fit went, frame by frame, and how sure it is.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::write_atomic;
+use crate::body::Length;
+use crate::fit::{Fit, Observation, problem::total};
+
+/// Fewer inlying points than this leave a frame to its neighbours.
+const FEW_POINTS: usize = 40;
+
+#[derive(Serialize)]
+struct FitReport<'a> {
+    software: &'static str,
+    model: &'a str,
+    model_hash: &'a str,
+    components: usize,
+    iterations: u64,
+    /// Robust cost, without priors.
+    cost: f64,
+    /// Robust costs of the chosen solution and of the one half a cycle away when they were compared.
+    hypothesis_costs: [f64; 2],
+    rms_distance_m: f64,
+    points: usize,
+    points_used: usize,
+    effective_measurements: f64,
+    speed_m_s: f64,
+    cadence_hz: f64,
+    hip_height_m: f64,
+    stature_m: f64,
+    stature_sigma_m: f64,
+    /// Factors on the template, by limb, with their standard deviations.
+    lengths: BTreeMap<String, [f64; 2]>,
+    widths: BTreeMap<String, [f64; 2]>,
+    /// Standard deviation of each weight over the population's; near 1 the footage said nothing about it.
+    weight_uncertainty: Vec<f64>,
+    frames: Vec<FrameReport>,
+}
+
+#[derive(Serialize)]
+struct FrameReport {
+    frame: usize,
+    time_s: f64,
+    status: &'static str,
+    points: usize,
+    points_used: usize,
+    rms_distance_m: Option<f64>,
+    phase: f64,
+    phase_sigma: f64,
+    position_sigma_m: f64,
+    heading_sigma_deg: f64,
+}
+
+/// Writes the report of `fit`, made with the model file `model` of content hash `model_hash`.
+pub fn write(path: &Path, fit: &Fit, observations: &[Observation], model: &str, model_hash: &str) -> std::io::Result<()> {
+    let sum = total(&fit.frames);
+    let layout = fit.state.layout();
+    let sigma = |i: usize| fit.shared_covariance[(i, i)].sqrt();
+    let limbs = |values: &[f64], index: &dyn Fn(Length) -> usize| {
+        Length::ALL.iter().map(|l| (format!("{l:?}").to_lowercase(), [values[*l as usize], sigma(index(*l))])).collect()
+    };
+    let shape = fit.shape();
+    let report = FitReport {
+        software: concat!("muybridge ", env!("CARGO_PKG_VERSION")),
+        model,
+        model_hash,
+        components: fit.state.weights.len(),
+        iterations: fit.iterations,
+        cost: sum.cost,
+        hypothesis_costs: fit.hypotheses,
+        rms_distance_m: fit.rms_m(),
+        points: observations.iter().map(|o| o.cloud.points.len()).sum(),
+        points_used: sum.inliers,
+        effective_measurements: sum.effective,
+        speed_m_s: fit.speed_m_s,
+        cadence_hz: fit.cadence_hz,
+        hip_height_m: shape.hip_height_m(),
+        stature_m: shape.stature_m,
+        stature_sigma_m: shape.stature_m * sigma(layout.stature()),
+        lengths: limbs(&shape.lengths, &|l| layout.length(l)),
+        widths: limbs(&shape.widths, &|l| layout.width(l)),
+        weight_uncertainty: fit.weight_uncertainty(),
+        frames: observations.iter().enumerate().map(|(t, o)| frame_report(fit, o, t)).collect(),
+    };
+    let mut text = serde_json::to_string_pretty(&report)?;
+    text.push('\n');
+    write_atomic(path, text.as_bytes())
+}
+
+fn frame_report(fit: &Fit, observation: &Observation, t: usize) -> FrameReport {
+    let (fitness, sigmas) = (&fit.frames[t], &fit.frame_sigmas[t]);
+    let status = match (observation.cloud.points.len(), fitness.inliers) {
+        (0, _) => "no cloud, from its neighbours",
+        (_, n) if n < FEW_POINTS => "few points, mostly from its neighbours",
+        _ => "fitted",
+    };
+    let norm = |v: &[f64]| v.iter().map(|s| s * s).sum::<f64>().sqrt();
+    FrameReport {
+        frame: observation.number,
+        time_s: observation.time_s,
+        status,
+        points: observation.cloud.points.len(),
+        points_used: fitness.inliers,
+        rms_distance_m: (fitness.inliers > 0).then(|| (fitness.inlier_square / fitness.inliers as f64).sqrt()),
+        phase: fit.state.carriers[t].phase,
+        phase_sigma: sigmas[6],
+        position_sigma_m: norm(&sigmas[3..6]),
+        heading_sigma_deg: norm(&sigmas[..3]).to_degrees(),
+    }
+}

@@ -1,0 +1,267 @@
+//! OpenSim joint angles (MOT, STO), read straight onto the 78 DOF.
+//!
+//! Coordinates and axes are those of the gait2392, Hamner and Rajagopal models (axes X forward, Y up, Z right; pelvis Z-X-Y
+//! body-fixed; the axes below are the models' own, read from a scaled Hamner model; left axes are the right ones with x and
+//! y negated). Lumbar angles go to vl5, pronation to the wrist, less the 90 degrees between the models' palms forward and ours in.
+//! Knee flexion is positive in Rajagopal's model and negative in the older ones: the mean sign decides.
+//! The file knows no lengths: stature is such that the template's soles reach the models' floor, y = 0.
+//! Checked by forward kinematics of the scaled model, normative gait curves and the sign of every angle on real data.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::mapping::{quantile, tidy_fps};
+use crate::body::{Clip, Joint, Pose, Shape};
+use crate::math::rotation::exp;
+
+#[derive(Debug, thiserror::Error)]
+pub enum MotError {
+    #[error("cannot read {path}: {source}")]
+    Read { path: PathBuf, source: std::io::Error },
+    #[error("{path}:{line}: {what}")]
+    Syntax { path: PathBuf, line: usize, what: String },
+    #[error("{path}: no column {columns}; write joint angles of a gait2392, Hamner or Rajagopal model")]
+    Columns { path: PathBuf, columns: String },
+    #[error("{path}: {what}")]
+    Content { path: PathBuf, what: String },
+}
+
+/// Line (from 1) and what is wrong there.
+type Fault = (usize, String);
+
+/// A table of columns over time.
+struct Table {
+    names: Vec<String>,
+    /// Without the rows that repeat a time stamp.
+    rows: Vec<Vec<f64>>,
+    repeated: usize,
+    degrees: bool,
+}
+
+/// Without these a motion cannot be placed; other coordinates are zero where absent.
+const REQUIRED: [&str; 10] = [
+    "pelvis_tilt",
+    "pelvis_list",
+    "pelvis_rotation",
+    "pelvis_tx",
+    "pelvis_ty",
+    "pelvis_tz",
+    "hip_flexion_r",
+    "hip_flexion_l",
+    "knee_angle_r",
+    "knee_angle_l",
+];
+
+/// Template hip joints from the pelvis' origin, fractions of stature: gait2392's -70.7 and -66.1 mm in a man of 1.80 m.
+const HIP_FORWARD: f64 = -0.0393;
+const HIP_UP: f64 = -0.0367;
+
+/// Reads a `.mot` or `.sto`; with the clip come notices, one sentence each.
+pub fn read(path: &Path) -> Result<(Clip, Vec<String>), MotError> {
+    let bytes = std::fs::read(path).map_err(|source| MotError::Read { path: path.into(), source })?;
+    let (table, mut notices) =
+        parse(&String::from_utf8_lossy(&bytes)).map_err(|(line, what)| MotError::Syntax { path: path.into(), line, what })?;
+    let missing: Vec<&str> = REQUIRED.into_iter().filter(|n| table.column(n).is_none()).collect();
+    if !missing.is_empty() {
+        return Err(MotError::Columns { path: path.into(), columns: missing.join(", ") });
+    }
+    if table.repeated > 0 {
+        notices.push(format!("dropped {} rows that repeat a time stamp", table.repeated));
+    }
+    let content = |what: String| MotError::Content { path: path.into(), what };
+    let fps = frame_rate(&table).map_err(content)?;
+    let clip = clip_of(&table, fps).map_err(|what| MotError::Content { path: path.into(), what })?;
+    Ok((clip, notices))
+}
+
+impl Table {
+    fn column(&self, name: &str) -> Option<usize> {
+        self.names.iter().position(|n| n == name)
+    }
+
+    fn mean(&self, name: &str) -> f64 {
+        let Some(column) = self.column(name) else { return 0.0 };
+        self.rows.iter().map(|r| r[column]).sum::<f64>() / self.rows.len() as f64
+    }
+}
+
+fn parse(text: &str) -> Result<(Table, Vec<String>), Fault> {
+    let mut lines = text.lines().enumerate().map(|(i, l)| (i + 1, l.trim()));
+    let (mut declared, mut degrees, mut simm, mut header_end) = (None, None, false, 0);
+    for (line, text) in lines.by_ref() {
+        header_end = line;
+        let lower = text.to_ascii_lowercase();
+        if lower == "endheader" {
+            break;
+        }
+        simm |= lower.contains("simm motion file") || lower.starts_with("datacolumns");
+        match lower.split_once(['=', ' ']).map(|(k, v)| (k.trim(), v.trim())) {
+            Some(("nrows" | "datarows", value)) => declared = value.parse::<usize>().ok().map(|n| (line, n)),
+            Some(("indegrees", value)) => degrees = Some(value == "yes"),
+            _ => {}
+        }
+    }
+    let mut lines = lines.filter(|(_, l)| !l.is_empty());
+    let (_, names) = lines.next().ok_or((header_end, "no column names after 'endheader'; the file is cut short".to_string()))?;
+    let names: Vec<String> = names.split_whitespace().map(coordinate).collect();
+    if names.first().map(String::as_str) != Some("time") {
+        return Err((header_end + 1, "the first column must be 'time'".into()));
+    }
+    let all = lines.map(|(line, text)| parse_row(&names, line, text)).collect::<Result<Vec<_>, _>>()?;
+    if let Some((line, n)) = declared.filter(|&(_, n)| n != all.len()) {
+        return Err((line, format!("{n} rows are declared but {} follow; correct the number or copy the file again", all.len())));
+    }
+    let mut notices = Vec::new();
+    if degrees.is_none() && !simm {
+        notices.push("the header does not say inDegrees; angles taken as degrees".to_string());
+    }
+    let (rows, repeated) = without_repeats(all)?;
+    Ok((Table { names, rows, repeated, degrees: degrees.unwrap_or(true) }, notices))
+}
+
+/// `hip_flexion_r` of `/jointset/hip_r/hip_flexion_r/value`.
+fn coordinate(name: &str) -> String {
+    name.strip_suffix("/value").and_then(|n| n.rsplit('/').next()).unwrap_or(name).to_string()
+}
+
+/// The line number and the values.
+fn parse_row(names: &[String], line: usize, text: &str) -> Result<(usize, Vec<f64>), Fault> {
+    let words: Vec<&str> = text.split_whitespace().collect();
+    if words.len() != names.len() {
+        return Err((line, format!("{} values where the table has {} columns; the line is cut", words.len(), names.len())));
+    }
+    let value = |(word, name): (&&str, &String)| match word.parse::<f64>() {
+        Ok(v) if v.is_finite() => Ok(v),
+        Ok(_) => Err((line, format!("column {name} holds {word}; fill the gap or cut the trial before it"))),
+        Err(_) => Err((line, format!("column {name} holds '{}', which is not a number", word.chars().take(40).collect::<String>()))),
+    };
+    Ok((line, words.iter().zip(names).map(value).collect::<Result<_, _>>()?))
+}
+
+fn without_repeats(all: Vec<(usize, Vec<f64>)>) -> Result<(Vec<Vec<f64>>, usize), Fault> {
+    let mut rows: Vec<Vec<f64>> = Vec::with_capacity(all.len());
+    let mut repeated = 0;
+    for (line, row) in all {
+        match rows.last().map(|last| row[0] - last[0]) {
+            Some(step) if step < 0.0 => return Err((line, format!("time runs back to {} s; sort the rows", row[0]))),
+            Some(step) if step < 1e-9 => repeated += 1,
+            _ => rows.push(row),
+        }
+    }
+    Ok((rows, repeated))
+}
+
+fn frame_rate(table: &Table) -> Result<f64, String> {
+    let [first, .., last] = &table.rows[..] else { return Err("fewer than two rows; a motion needs more".into()) };
+    let mean = (last[0] - first[0]) / (table.rows.len() - 1) as f64;
+    for pair in table.rows.windows(2) {
+        let step = pair[1][0] - pair[0][0];
+        if (step - mean).abs() > 0.2 * mean {
+            return Err(format!(
+                "the time step after {} s is {step:.5} s where the mean is {mean:.5} s; resample at a constant rate",
+                pair[0][0]
+            ));
+        }
+    }
+    Ok(tidy_fps(1.0 / mean))
+}
+
+fn clip_of(table: &Table, fps: f64) -> Result<Clip, String> {
+    let angle = if table.degrees { 1f64.to_radians() } else { 1.0 };
+    let knee_sign = if table.mean("knee_angle_r") + table.mean("knee_angle_l") < 0.0 { -1.0 } else { 1.0 };
+    let origins: Vec<Vector3<f64>> = table.rows.iter().map(|row| pelvis_origin(&Row { table, row, angle })).collect();
+    let mut poses: Vec<Pose> = table.rows.iter().map(|row| pose_of(&Row { table, row, angle }, knee_sign)).collect();
+    let stature = stature_of(&poses, &origins)?;
+    let shape = Shape::template(stature);
+    for (pose, origin) in poses.iter_mut().zip(&origins) {
+        pose.root = origin + pose.world_from_root * root_from_origin(stature);
+    }
+    Ok(Clip { fps, poses, offsets: shape.offsets(), hip_height_m: shape.hip_height_m() })
+}
+
+/// One row of the table.
+struct Row<'a> {
+    table: &'a Table,
+    row: &'a [f64],
+    /// Radians per unit of angle.
+    angle: f64,
+}
+
+impl Row<'_> {
+    fn value(&self, name: &str) -> f64 {
+        self.table.column(name).and_then(|c| self.row.get(c)).copied().unwrap_or(0.0)
+    }
+
+    /// Rotation about an axis of OpenSim's by a coordinate, in our axes.
+    fn turn(&self, axis: [f64; 3], name: &str) -> UnitQuaternion<f64> {
+        exp(&(ours(axis).normalize() * self.value(name) * self.angle))
+    }
+}
+
+/// OpenSim's X forward, Y up, Z right as ours: x left, y up, z forward.
+fn ours([x, y, z]: [f64; 3]) -> Vector3<f64> {
+    Vector3::new(-z, y, x)
+}
+
+fn pelvis_origin(row: &Row) -> Vector3<f64> {
+    ours(["pelvis_tx", "pelvis_ty", "pelvis_tz"].map(|n| row.value(n)))
+}
+
+/// Our root from the pelvis' origin in body axes.
+fn root_from_origin(stature: f64) -> Vector3<f64> {
+    let rise = Joint::Root.rest_position().y - Joint::LHip.rest_position().y;
+    stature * Vector3::new(0.0, HIP_UP + rise, HIP_FORWARD)
+}
+
+const X: [f64; 3] = [1.0, 0.0, 0.0];
+const Y: [f64; 3] = [0.0, 1.0, 0.0];
+const Z: [f64; 3] = [0.0, 0.0, 1.0];
+const ANKLE: [f64; 3] = [-0.105014, -0.174022, 0.979126];
+const SUBTALAR: [f64; 3] = [0.787180, 0.604747, -0.120949];
+const TOES: [f64; 3] = [-0.580954, 0.0, 0.813936];
+const ELBOW: [f64; 3] = [0.226047, 0.022269, 0.973862];
+const PRONATION: [f64; 3] = [0.056398, 0.998406, 0.001952];
+
+/// Everything but the root's position.
+fn pose_of(row: &Row, knee_sign: f64) -> Pose {
+    use Joint::*;
+    let mut pose = Pose::rest(Vector3::zeros());
+    pose.world_from_root = row.turn(Z, "pelvis_tilt") * row.turn(X, "pelvis_list") * row.turn(Y, "pelvis_rotation");
+    let mut set = |joint: Joint, rotation: UnitQuaternion<f64>| pose.joints[joint as usize - 1] = rotation;
+    set(Vl5, row.turn(Z, "lumbar_extension") * row.turn(X, "lumbar_bending") * row.turn(Y, "lumbar_rotation"));
+    for (side, mirror, [hip, knee, ankle, ball, shoulder, elbow, wrist]) in [
+        ("r", 1.0, [RHip, RKnee, RAnkle, RMidtarsal, RShoulder, RElbow, RWrist]),
+        ("l", -1.0, [LHip, LKnee, LAnkle, LMidtarsal, LShoulder, LElbow, LWrist]),
+    ] {
+        let turn = |[x, y, z]: [f64; 3], name: &str| row.turn([mirror * x, mirror * y, z], &format!("{name}_{side}"));
+        set(hip, turn(Z, "hip_flexion") * turn(X, "hip_adduction") * turn(Y, "hip_rotation"));
+        set(knee, turn([0.0, 0.0, -knee_sign], "knee_angle"));
+        set(ankle, turn(ANKLE, "ankle_angle") * turn(SUBTALAR, "subtalar_angle"));
+        set(ball, turn(TOES, "mtp_angle"));
+        set(shoulder, turn(Z, "arm_flex") * turn(X, "arm_add") * turn(Y, "arm_rot"));
+        set(elbow, turn(ELBOW, "elbow_flex"));
+        let [x, y, z] = PRONATION;
+        let palm_in = row.table.column(&format!("pro_sup_{side}")).map_or(0.0, |_| std::f64::consts::FRAC_PI_2);
+        let neutral = exp(&(ours([mirror * x, mirror * y, z]).normalize() * -palm_in));
+        set(wrist, turn(PRONATION, "pro_sup") * neutral * turn(Z, "wrist_flex") * turn(X, "wrist_dev"));
+    }
+    pose
+}
+
+/// The stature whose soles reach y = 0 when the pelvis is where the file says: the lower fifth over the frames of
+/// pelvis height / (height above the sole per metre of stature), since flight makes the ratio larger.
+fn stature_of(poses: &[Pose], origins: &[Vector3<f64>]) -> Result<f64, String> {
+    let unit = Shape::template(1.0);
+    let clip = Clip { fps: 1.0, poses: Vec::new(), offsets: unit.offsets(), hip_height_m: unit.hip_height_m() };
+    let ratio = |(pose, origin): (&Pose, &Vector3<f64>)| {
+        let mut placed = pose.clone();
+        placed.root = pose.world_from_root * root_from_origin(1.0);
+        origin.y / -clip.sole_height(&placed)
+    };
+    let stature = quantile(&mut poses.iter().zip(origins).map(ratio).collect::<Vec<f64>>(), 0.2);
+    if (0.8..2.5).contains(&stature) {
+        return Ok(stature);
+    }
+    Err(format!("pelvis_ty implies a stature of {stature:.2} m; it must be the pelvis' height in metres above the floor y = 0"))
+}

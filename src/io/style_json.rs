@@ -1,0 +1,64 @@
+//! `style.json`: a person's weights in one model.
+
+use std::path::{Path, PathBuf};
+
+use super::write_atomic;
+use crate::style::Style;
+
+#[derive(Debug, thiserror::Error)]
+pub enum StyleFileError {
+    #[error("cannot read {path}: {source}")]
+    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot write {path}: {source}")]
+    Write { path: PathBuf, source: std::io::Error },
+    #[error("{path} is no style file: {why}")]
+    Parse { path: PathBuf, why: String },
+}
+
+pub fn read_style(path: &Path) -> Result<Style, StyleFileError> {
+    let text = std::fs::read_to_string(path).map_err(|source| StyleFileError::Read { path: path.to_path_buf(), source })?;
+    let failed = |why: String| StyleFileError::Parse { path: path.to_path_buf(), why };
+    let style: Style = serde_json::from_str(&text).map_err(|e| failed(e.to_string()))?;
+    let positive = [style.hip_height_m, style.cadence_factor];
+    if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || !style.parameter.is_finite() {
+        return Err(failed("parameter, hip_height_m and cadence_factor must be finite, the last two positive".into()));
+    }
+    Ok(style)
+}
+
+pub fn write_style(path: &Path, style: &Style) -> Result<(), StyleFileError> {
+    let failed = |source| StyleFileError::Write { path: path.to_path_buf(), source };
+    let mut text = serde_json::to_string_pretty(style).map_err(|e| failed(e.into()))?;
+    text.push('\n');
+    write_atomic(path, text.as_bytes()).map_err(failed)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion_model::Activity;
+    use crate::style::Neighbour;
+
+    #[test]
+    fn comes_back_as_written_and_refuses_other_files() {
+        let style = Style {
+            activity: Activity::Walking,
+            model_hash: "ab".into(),
+            parameter: 1.1,
+            hip_height_m: 0.9,
+            weights: vec![0.1, -2.5e-3],
+            covariance: Some(vec![vec![1e-4, 0.0], vec![0.0, 2e-4]]),
+            cadence_factor: 1.02,
+            neighbours: vec![Neighbour { subject: "12".into(), distance: 0.3 }],
+            shape: None,
+        };
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("style.json");
+        write_style(&path, &style).unwrap();
+        assert_eq!(read_style(&path).unwrap(), style);
+        for text in ["{}", "no json", &serde_json::to_string(&Style { hip_height_m: 0.0, ..style }).unwrap()] {
+            std::fs::write(&path, text).unwrap();
+            assert!(read_style(&path).unwrap_err().to_string().contains("is no style file"));
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! Plays a motion model's cycle at a wanted speed or jump length (style paper §5.1).
+//!
+//!   μ_t = μ_{t−1} + Δt F,   f = μ_t N                                                                        (9), (10)
+//! with F = κ a V^b, the model's own cadence law at V = v/H times the person's factor κ. Root lengths are multiplied by the
+//! target's hip height H. The carrier goes straight along +z at exactly v, so the mean speed of whole cycles is v.
+//!
+//! Size: bodies are alike at equal V (Murray), so a body of hip height H at v moves as the observed one of H_x does at
+//! v H_x/H; jump lengths scale in the same way, and their durations with √(H/H_x).
+//! A jump's progress is scaled so that it ends at the wanted length.
+//! Checked against the wanted speed, the law's frequency, and a cycle of the database played at its own speed.
+
+use nalgebra::{DVector, Vector3};
+
+use crate::body::{Clip, NODES, Pose};
+use crate::math::rotation::exp;
+use crate::motion_model::{Model, RootSample};
+use crate::style::{Metric, Population, Style, StyleError, extrapolate};
+
+/// A jump's progress is only stretched by factors in this range: beyond, the weights describe another kind of jump.
+const STRETCH: std::ops::RangeInclusive<f64> = 0.4..=2.5;
+
+/// A motion ready to play.
+#[derive(Clone, Debug)]
+pub struct Synthesis {
+    pub weights: DVector<f64>,
+    /// Wanted speed in m/s or jump length in m.
+    pub parameter: f64,
+    /// Hip height of the body that is to move.
+    pub hip_height_m: f64,
+    /// Cycles (jumps) per second.
+    pub frequency_hz: f64,
+    pub notice: Option<String>,
+}
+
+/// How much to play.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Length {
+    /// Whole cycles; a jump is played once whatever the number.
+    Cycles(usize),
+    Seconds(f64),
+}
+
+/// Weights and cadence of `style` at `parameter` for a body with `hip_height_m`; `population` comes from the same model.
+pub fn synthesize(
+    model: &Model,
+    population: &Population,
+    metric: Metric,
+    style: &Style,
+    parameter: f64,
+    hip_height_m: f64,
+) -> Result<Synthesis, StyleError> {
+    let at_own_size = parameter * style.hip_height_m / hip_height_m;
+    let found = extrapolate(population, metric, &style.weights, style.parameter, at_own_size)?;
+    let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(parameter, hip_height_m);
+    Ok(Synthesis { weights: found.weights, parameter, hip_height_m, frequency_hz, notice: found.notice })
+}
+
+/// Plays at `fps` from the start of a cycle; `offsets` are those of the body that moves.
+pub fn play(model: &Model, synthesis: &Synthesis, offsets: &[Vector3<f64>; NODES], fps: f64, length: Length) -> Clip {
+    let cyclic = model.activity.is_cyclic();
+    let seconds = match length {
+        Length::Cycles(n) if cyclic => n as f64 / synthesis.frequency_hz,
+        Length::Seconds(s) => s,
+        Length::Cycles(_) => 1.0 / synthesis.frequency_hz,
+    };
+    let stretch = if cyclic { 1.0 } else { stretch(model, synthesis) };
+    let frames = (seconds * fps).round() as usize + 1;
+    let poses = (0..frames)
+        .map(|frame| {
+            let time_s = frame as f64 / fps;
+            let (joints, root) = model.posture(synthesis.weights.as_slice(), time_s * synthesis.frequency_hz);
+            let travelled_m = if cyclic { synthesis.parameter * time_s } else { 0.0 };
+            Pose { root: root_position(&root, synthesis.hip_height_m, travelled_m, stretch), world_from_root: exp(&root.rotation), joints }
+        })
+        .collect();
+    Clip { fps, poses, offsets: *offsets, hip_height_m: synthesis.hip_height_m }
+}
+
+fn root_position(root: &RootSample, hip_height_m: f64, travelled_m: f64, stretch: f64) -> Vector3<f64> {
+    let p = root.position;
+    Vector3::new(p.x, 1.0 + p.y, p.z * stretch) * hip_height_m + Vector3::new(0.0, 0.0, travelled_m)
+}
+
+/// Factor that makes a jump end at the wanted length.
+fn stretch(model: &Model, synthesis: &Synthesis) -> f64 {
+    let (_, end) = model.posture(synthesis.weights.as_slice(), 1.0);
+    let factor = synthesis.parameter / (end.position.z * synthesis.hip_height_m);
+    if STRETCH.contains(&factor) { factor } else { 1.0 }
+}

@@ -1,0 +1,496 @@
+//! Cuts clips into gait cycles and jumps and resamples them to N = 100 postures (style paper §3.1, §3.2).
+//!
+//! Gait. Heel strikes are the maxima of the heel's position ahead of the root along the local heading (Zeni et al. 2008,
+//! Gait & Posture 27(4)), which needs no floor and works on a treadmill, whose belt is added to the root's path first.
+//! A cycle runs from one right strike to the next. Its carrier follows the circular arc through the root's first and last
+//! position whose turn Δψ is the change of the root's yaw between two equal phases:
+//!   heading ψ(μ) = ψ0 + Δψ μ,   ψ0 = direction of the chord − Δψ/2,   arc length L = chord · (Δψ/2)/sin(Δψ/2)     (1)
+//! so a turning walk has the path speed L/T, and what is left of the root is periodic. The small difference that remains
+//! between the first and the last posture, e = log(q(0)⁻¹ q(1)), is spread over the cycle:
+//!   q(μ) ← q(μ) exp((½ − μ) e).                                                                                  (2)
+//!
+//! Jumps. The longest flight of both feet gives take-off and landing; the start is where the counter-movement begins, the
+//! end where the root has come to rest; the frames between are sampled at regular times, as in the paper.
+//!
+//! Departure: in running Zeni's maximum comes a few per cent of the cycle before the contact, the same for everybody.
+//! Fails when: the person walks backwards or sidewards, or the root's forward axis points up.
+//! Checked against an analytic walker with known strikes and speed, and against the strides and speeds of recorded walks.
+
+use std::ops::Range;
+
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
+
+use super::cycle::{Activity, Cycle, RootSample, SAMPLES};
+use crate::body::{BALL_JOINTS, Clip, Joint, Pose, place};
+use crate::math::rotation::{exp, log};
+
+/// Heel behind and below the ankle, as fractions of the hip height: enough to see the swing end at the heel.
+const HEEL: (f64, f64) = (-0.06, -0.07);
+/// A maximum counts when the signal rises and falls by this part of its range around it; less lets wiggles of a shaky
+/// recording in, more loses short strides beside long ones.
+const PEAK_DROP: f64 = 0.2;
+/// A clip whose root is slower than this is a treadmill's, or a stand, m/s.
+const TRAVELS_M_S: f64 = 0.2;
+/// Largest difference of a leg joint between the two ends of a cycle: starting, stopping and stumbling strides differ by
+/// more, steady ones by 2 to 8 degrees.
+const MISMATCH_RAD: f64 = 0.35;
+/// Durations of a cycle, seconds; a missed strike doubles it.
+const DURATION_S: Range<f64> = 0.4..3.0;
+/// Normalised speeds V = v/H in 1/s at which people walk, and at which they run.
+const WALKING_V: Range<f64> = 0.2..2.8;
+const RUNNING_V: Range<f64> = 1.5..9.0;
+/// A flight lifts both ankles by this part of the hip height for at least [`FLIGHT_S`].
+const FLIGHT_RISE: f64 = 0.05;
+const FLIGHT_S: f64 = 0.1;
+/// Vertical speed of the root that counts as moving, m/s, and how long it must rest to have settled.
+const RESTS_M_S: f64 = 0.1;
+const SETTLED_S: f64 = 0.2;
+
+/// What is known of a clip beforehand.
+#[derive(Clone, Debug)]
+pub struct Label {
+    pub subject: String,
+    /// Name of the file, for [`Cycle::source`].
+    pub source: String,
+    pub activity: Activity,
+    /// Speed in m/s or jump length in m where it was measured otherwise; needed on a treadmill.
+    pub parameter: Option<f64>,
+    /// Part of the clip to use, seconds from its start.
+    pub start_s: Option<f64>,
+    pub end_s: Option<f64>,
+}
+
+/// Cycles of a clip, and for each stretch that was refused the reason.
+#[derive(Clone, Debug, Default)]
+pub struct Segments {
+    pub cycles: Vec<Cycle>,
+    pub rejected: Vec<String>,
+}
+
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum SegmentError {
+    #[error("has {frames} frames in the part to use ({seconds:.2} s), too few for a {activity}")]
+    Short { frames: usize, seconds: f64, activity: &'static str },
+    #[error("stands still ({speed_m_s:.2} m/s): if it is a treadmill's, give its speed as speed_m_s in subjects.csv")]
+    Standing { speed_m_s: f64 },
+    #[error("shows {strikes} right heel strikes, two are needed for a cycle")]
+    NoStride { strikes: usize },
+    #[error("never has both feet in the air for {FLIGHT_S} s, so it is no jump")]
+    NoFlight,
+    #[error("has a hip height of {0} m; it must be positive")]
+    HipHeight(f64),
+}
+
+/// Cuts `clip` into cycles (right heel strike to the next) or jumps. Stretches that are no steady cycle are listed, not
+/// returned.
+pub fn segment(clip: &Clip, label: &Label) -> Result<Segments, SegmentError> {
+    if !(clip.hip_height_m > 0.0 && clip.hip_height_m.is_finite()) {
+        return Err(SegmentError::HipHeight(clip.hip_height_m));
+    }
+    let frame = |time_s: f64| (time_s.max(0.0) * clip.fps).round() as usize;
+    let end = label.end_s.map_or(clip.poses.len(), |t| (frame(t) + 1).min(clip.poses.len()));
+    let start = label.start_s.map_or(0, frame).min(end);
+    let track = Track::new(clip, start..end);
+    let activity = if label.activity.is_cyclic() { "gait cycle" } else { "jump" };
+    let seconds = track.poses.len() as f64 / clip.fps;
+    if seconds < DURATION_S.start || track.poses.len() < 8 {
+        return Err(SegmentError::Short { frames: track.poses.len(), seconds, activity });
+    }
+    if label.activity.is_cyclic() { gait(track, label) } else { jumps(&track, label) }
+}
+
+/// A clip's poses with the positions that events are read from.
+struct Track {
+    fps: f64,
+    hip_height_m: f64,
+    /// Length of the straight leg from hip joint to ankle, metres.
+    leg_m: f64,
+    /// Time of the first frame in the clip, seconds.
+    start_s: f64,
+    poses: Vec<Pose>,
+    /// Right and left heel, right and left ankle.
+    heels: [Vec<Vector3<f64>>; 2],
+    ankles: [Vec<Vector3<f64>>; 2],
+}
+
+impl Track {
+    fn new(clip: &Clip, frames: Range<usize>) -> Track {
+        let poses = clip.poses[frames.clone()].to_vec();
+        let heel = Vector3::new(0.0, HEEL.1, HEEL.0) * clip.hip_height_m;
+        let mut track = Track {
+            fps: clip.fps,
+            hip_height_m: clip.hip_height_m,
+            leg_m: clip.offsets[Joint::RKnee as usize].norm() + clip.offsets[Joint::RAnkle as usize].norm(),
+            start_s: frames.start as f64 / clip.fps,
+            heels: Default::default(),
+            ankles: Default::default(),
+            poses,
+        };
+        for pose in &track.poses {
+            let placed = place(&clip.offsets, pose);
+            for (side, joint) in [Joint::RAnkle, Joint::LAnkle].into_iter().enumerate() {
+                track.ankles[side].push(placed.position(joint));
+                track.heels[side].push(placed.position(joint) + placed.world_from_node[joint as usize] * heel);
+            }
+        }
+        track
+    }
+
+    fn frames(&self, seconds: f64) -> usize {
+        (seconds * self.fps).round() as usize
+    }
+
+    /// Pose between frames, `at` in frames; the ends are clamped.
+    fn pose_at(&self, at: f64) -> Pose {
+        let i = (at.max(0.0) as usize).min(self.poses.len() - 2);
+        let part = (at - i as f64).clamp(0.0, 1.0);
+        let (a, b) = (&self.poses[i], &self.poses[i + 1]);
+        Pose {
+            root: a.root.lerp(&b.root, part),
+            world_from_root: slerp(&a.world_from_root, &b.world_from_root, part),
+            joints: std::array::from_fn(|j| slerp(&a.joints[j], &b.joints[j], part)),
+        }
+    }
+
+    /// Height of the floor between two frames, from the lowest ankle: standing, the hip joint is at H over it.
+    fn floor_m(&self, frames: Range<usize>) -> f64 {
+        let lowest = self.ankles.iter().flat_map(|side| &side[frames.clone()]).map(|p| p.y).fold(f64::INFINITY, f64::min);
+        lowest - (self.hip_height_m - self.leg_m)
+    }
+
+    /// Adds the belt's way, so that a treadmill's clip travels like any other.
+    fn add_belt(&mut self, speed_m_s: f64) {
+        let facing: Vector2<f64> = self.poses.iter().map(facing).sum();
+        let step = facing.normalize() * (speed_m_s / self.fps);
+        for i in 0..self.poses.len() {
+            let way = Vector3::new(step.x, 0.0, step.y) * i as f64;
+            self.poses[i].root += way;
+            self.heels.iter_mut().chain(&mut self.ankles).for_each(|side| side[i] += way);
+        }
+    }
+
+    fn place_name(&self, label: &Label, from: f64, to: f64) -> String {
+        let time = |frame: f64| self.start_s + frame / self.fps;
+        format!("{} {:.2}-{:.2} s", label.source, time(from), time(to))
+    }
+}
+
+/// The shorter way between two rotations.
+fn slerp(a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>, part: f64) -> UnitQuaternion<f64> {
+    a * exp(&(log(&(a.inverse() * b)) * part))
+}
+
+/// Where the root points on the floor: (x, z) of unit length.
+fn facing(pose: &Pose) -> Vector2<f64> {
+    ground(&(pose.world_from_root * Vector3::z())).try_normalize(1e-9).unwrap_or(Vector2::y())
+}
+
+fn ground(v: &Vector3<f64>) -> Vector2<f64> {
+    Vector2::new(v.x, v.z)
+}
+
+/// Angle about +y that turns z into the ground direction (x, z).
+fn yaw(direction: &Vector2<f64>) -> f64 {
+    direction.x.atan2(direction.y)
+}
+
+fn wrapped(angle: f64) -> f64 {
+    use std::f64::consts::PI;
+    (angle + PI).rem_euclid(2.0 * PI) - PI
+}
+
+fn gait(mut track: Track, label: &Label) -> Result<Segments, SegmentError> {
+    let speed_m_s = travel_speed(&track);
+    match label.parameter {
+        Some(belt) if speed_m_s < 0.4 * belt => track.add_belt(belt),
+        None if speed_m_s < TRAVELS_M_S => return Err(SegmentError::Standing { speed_m_s }),
+        _ => {}
+    }
+    let strikes = strikes(&track);
+    if strikes.len() < 2 {
+        return Err(SegmentError::NoStride { strikes: strikes.len() });
+    }
+    let mut segments = Segments::default();
+    for pair in strikes.windows(2) {
+        match gait_cycle(&track, pair[0], pair[1], label) {
+            Ok(cycle) => segments.cycles.push(cycle),
+            Err(reason) => segments.rejected.push(format!("{}: {reason}", track.place_name(label, pair[0], pair[1]))),
+        }
+    }
+    Ok(segments)
+}
+
+/// Median speed of the root over half seconds, m/s.
+fn travel_speed(track: &Track) -> f64 {
+    let step = track.frames(0.5).clamp(1, track.poses.len() - 1);
+    let mut speeds: Vec<f64> = (0..track.poses.len() - step)
+        .map(|i| ground(&(track.poses[i + step].root - track.poses[i].root)).norm() * track.fps / step as f64)
+        .collect();
+    speeds.sort_by(f64::total_cmp);
+    speeds[speeds.len() / 2]
+}
+
+/// Right heel strikes in frames, with fractions.
+fn strikes(track: &Track) -> Vec<f64> {
+    let facings: Vec<Vector2<f64>> = track.poses.iter().map(facing).collect();
+    let half = track.frames(0.5);
+    let ahead: Vec<f64> = (0..facings.len())
+        .map(|i| {
+            let heading: Vector2<f64> = facings[i.saturating_sub(half)..(i + half + 1).min(facings.len())].iter().sum();
+            let heading = heading.try_normalize(1e-9).unwrap_or(facings[i]);
+            heading.dot(&ground(&(track.heels[0][i] - track.poses[i].root)))
+        })
+        .collect();
+    maxima(&smooth(&ahead, 0.02 * track.fps))
+}
+
+/// Gaussian average with `sigma` in samples; the ends average what there is.
+fn smooth(x: &[f64], sigma: f64) -> Vec<f64> {
+    let reach = (3.0 * sigma).ceil() as isize;
+    let kernel: Vec<f64> = (-reach..=reach).map(|k| (-0.5 * (k as f64 / sigma).powi(2)).exp()).collect();
+    (0..x.len() as isize)
+        .map(|i| {
+            let (mut sum, mut weight) = (0.0, 0.0);
+            for (k, w) in (-reach..=reach).zip(&kernel) {
+                if let Some(value) = usize::try_from(i + k).ok().and_then(|j| x.get(j)) {
+                    sum += w * value;
+                    weight += w;
+                }
+            }
+            sum / weight
+        })
+        .collect()
+}
+
+/// Places of the maxima that stand out by [`PEAK_DROP`] of the range, to parts of a sample by a parabola.
+fn maxima(x: &[f64]) -> Vec<f64> {
+    let mut sorted = x.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let drop = PEAK_DROP * (sorted[sorted.len() * 95 / 100] - sorted[sorted.len() * 5 / 100]);
+    let (mut found, mut rising, mut best) = (Vec::new(), true, 0);
+    for i in 0..x.len() {
+        if rising && x[i] > x[best] || !rising && x[i] < x[best] {
+            best = i;
+        } else if (x[best] - x[i]).abs() > drop {
+            if rising && best > 0 && x[best] - x[0] > 0.1 * drop {
+                found.push(best);
+            }
+            rising = !rising;
+            best = i;
+        }
+    }
+    found.into_iter().map(|i| i as f64 + vertex(x[i - 1], x[i], x[i + 1])).collect()
+}
+
+/// Vertex of the parabola through three neighbours, between −½ and ½.
+fn vertex(before: f64, at: f64, after: f64) -> f64 {
+    let bend = before - 2.0 * at + after;
+    if bend >= 0.0 { 0.0 } else { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) }
+}
+
+fn gait_cycle(track: &Track, from: f64, to: f64, label: &Label) -> Result<Cycle, String> {
+    let duration_s = (to - from) / track.fps;
+    if !DURATION_S.contains(&duration_s) {
+        return Err(format!("lasts {duration_s:.2} s, a heel strike is missing or false"));
+    }
+    let poses: Vec<Pose> = (0..=SAMPLES).map(|k| track.pose_at(from + (to - from) * k as f64 / SAMPLES as f64)).collect();
+    let (joint, mismatch) = largest_leg_mismatch(&poses[0], &poses[SAMPLES]);
+    if mismatch > MISMATCH_RAD {
+        return Err(format!("not a steady cycle: {} differs by {:.0} degrees between its ends", joint.name(), mismatch.to_degrees()));
+    }
+    let arc = Arc::through(&poses[0], &poses[SAMPLES]);
+    let speed_m_s = arc.length_m / duration_s;
+    let (name, range) = if label.activity == Activity::Walking { ("walking", WALKING_V) } else { ("running", RUNNING_V) };
+    if !range.contains(&(speed_m_s / track.hip_height_m)) {
+        return Err(format!("{speed_m_s:.2} m/s is not {name} for a hip height of {:.2} m", track.hip_height_m));
+    }
+    let floor_m = track.floor_m(from.round() as usize..(to.round() as usize + 1).min(track.poses.len()));
+    Ok(Cycle {
+        subject: label.subject.clone(),
+        source: track.place_name(label, from, to),
+        activity: label.activity,
+        parameter: label.parameter.unwrap_or(speed_m_s),
+        hip_height_m: track.hip_height_m,
+        duration_s,
+        joints: closed_joints(&poses),
+        root: periodic_root(&poses, &arc, floor_m, track.hip_height_m),
+    })
+}
+
+fn largest_leg_mismatch(first: &Pose, last: &Pose) -> (Joint, f64) {
+    use Joint::*;
+    [LHip, LKnee, LAnkle, RHip, RKnee, RAnkle]
+        .map(|j| (j, first.joint(j).angle_to(last.joint(j))))
+        .into_iter()
+        .fold((LHip, 0.0), |most, next| if next.1 > most.1 { next } else { most })
+}
+
+/// Equation (2) on the N samples of N + 1 poses.
+fn closed_joints(poses: &[Pose]) -> Vec<[UnitQuaternion<f64>; BALL_JOINTS]> {
+    let drift: [Vector3<f64>; BALL_JOINTS] = std::array::from_fn(|j| log(&(poses[0].joints[j].inverse() * poses[SAMPLES].joints[j])));
+    (0..SAMPLES)
+        .map(|k| {
+            let part = 0.5 - k as f64 / SAMPLES as f64;
+            std::array::from_fn(|j| poses[k].joints[j] * exp(&(drift[j] * part)))
+        })
+        .collect()
+}
+
+/// The carrier's path of equation (1) on the floor; vectors are (x, z).
+struct Arc {
+    start: Vector2<f64>,
+    heading: f64,
+    turn: f64,
+    length_m: f64,
+}
+
+impl Arc {
+    fn through(first: &Pose, last: &Pose) -> Arc {
+        let chord = ground(&(last.root - first.root));
+        let turn = wrapped(yaw(&facing(last)) - yaw(&facing(first)));
+        Arc { start: ground(&first.root), heading: yaw(&chord) - turn / 2.0, turn, length_m: chord.norm() / sinc(turn / 2.0) }
+    }
+
+    fn heading(&self, phase: f64) -> f64 {
+        self.heading + self.turn * phase
+    }
+
+    fn position(&self, phase: f64) -> Vector2<f64> {
+        let half_turn = self.turn * phase / 2.0;
+        let (sin, cos) = (self.heading + half_turn).sin_cos();
+        self.start + Vector2::new(sin, cos) * (self.length_m * phase * sinc(half_turn))
+    }
+}
+
+fn sinc(x: f64) -> f64 {
+    if x.abs() < 1e-6 { 1.0 } else { x.sin() / x }
+}
+
+/// Root against the arc, closed like the joints; sway and progress have mean zero.
+fn periodic_root(poses: &[Pose], arc: &Arc, floor_m: f64, hip_height_m: f64) -> Vec<RootSample> {
+    let in_carrier: Vec<(UnitQuaternion<f64>, Vector3<f64>)> = poses
+        .iter()
+        .enumerate()
+        .map(|(k, pose)| {
+            let phase = k as f64 / SAMPLES as f64;
+            let on_floor = arc.position(phase);
+            let carrier = Vector3::new(on_floor.x, floor_m + hip_height_m, on_floor.y);
+            let carrier_from_world = exp(&Vector3::new(0.0, -arc.heading(phase), 0.0));
+            (carrier_from_world * pose.world_from_root, carrier_from_world * (pose.root - carrier) / hip_height_m)
+        })
+        .collect();
+    let drift = log(&(in_carrier[0].0.inverse() * in_carrier[SAMPLES].0));
+    let rise = in_carrier[SAMPLES].1 - in_carrier[0].1;
+    let mut samples: Vec<RootSample> = (0..SAMPLES)
+        .map(|k| {
+            let part = 0.5 - k as f64 / SAMPLES as f64;
+            let (rotation, position) = &in_carrier[k];
+            RootSample { rotation: log(&(rotation * exp(&(drift * part)))), position: position + rise * part }
+        })
+        .collect();
+    let mut mean = samples.iter().map(|s| s.position).sum::<Vector3<f64>>() / SAMPLES as f64;
+    mean.y = 0.0;
+    samples.iter_mut().for_each(|s| s.position -= mean);
+    samples
+}
+
+/// Frames of a jump's key events.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct JumpEvents {
+    start: usize,
+    take_off: usize,
+    landing: usize,
+    end: usize,
+}
+
+fn jumps(track: &Track, label: &Label) -> Result<Segments, SegmentError> {
+    let flights = flights(track);
+    if flights.is_empty() {
+        return Err(SegmentError::NoFlight);
+    }
+    let mut segments = Segments::default();
+    let mut free_from = 0;
+    for flight in flights {
+        let events = key_events(track, flight);
+        let place = track.place_name(label, events.start as f64, events.end as f64);
+        if events.start < free_from {
+            segments.rejected.push(format!("{place}: begins before the jump before it has settled"));
+            continue;
+        }
+        free_from = events.end;
+        segments.cycles.push(jump(track, events, label));
+    }
+    Ok(segments)
+}
+
+/// Frames during which both ankles are up in the air.
+fn flights(track: &Track) -> Vec<Range<usize>> {
+    let lower: Vec<f64> = (0..track.poses.len()).map(|i| track.ankles[0][i].y.min(track.ankles[1][i].y)).collect();
+    let mut sorted = lower.clone();
+    sorted.sort_by(f64::total_cmp);
+    let ground_m = sorted[sorted.len() / 10];
+    let up = |i: usize| lower[i] > ground_m + FLIGHT_RISE * track.hip_height_m;
+    let mut found = Vec::new();
+    let mut i = 0;
+    while i < lower.len() {
+        let from = i;
+        while i < lower.len() && up(i) {
+            i += 1;
+        }
+        // A flight that touches the clip's ends has no take-off or no landing.
+        if i - from >= track.frames(FLIGHT_S).max(1) && from > 0 && i < lower.len() {
+            found.push(from..i);
+        }
+        i += 1;
+    }
+    found
+}
+
+fn key_events(track: &Track, flight: Range<usize>) -> JumpEvents {
+    let height: Vec<f64> = smooth(&track.poses.iter().map(|p| p.root.y).collect::<Vec<_>>(), 0.02 * track.fps);
+    let last = height.len() - 1;
+    let velocity = |i: usize| (height[(i + 1).min(last)] - height[i.saturating_sub(1)]) * track.fps / 2.0;
+    let crouch_from = flight.start.saturating_sub(track.frames(1.0));
+    let crouch = (crouch_from..=flight.start).min_by(|&a, &b| height[a].total_cmp(&height[b])).unwrap_or(flight.start);
+    let mut start = (crouch_from..=crouch).min_by(|&a, &b| velocity(a).total_cmp(&velocity(b))).unwrap_or(crouch);
+    while start > 0 && velocity(start) < -RESTS_M_S {
+        start -= 1;
+    }
+    let calm = track.frames(SETTLED_S).max(1);
+    // The squat after landing rests for a moment too: settled means up again, so search from the lowest point on.
+    let squat_to = (flight.end + track.frames(0.6)).min(last);
+    let squat = (flight.end..=squat_to).min_by(|&a, &b| height[a].total_cmp(&height[b])).unwrap_or(flight.end);
+    let risen = (squat..=last).find(|&i| velocity(i) > RESTS_M_S).unwrap_or(squat);
+    let end = (risen..=last).find(|&i| (i..=(i + calm).min(last)).all(|j| velocity(j).abs() < RESTS_M_S)).unwrap_or(last);
+    JumpEvents { start, take_off: flight.start, landing: flight.end, end }
+}
+
+fn jump(track: &Track, events: JumpEvents, label: &Label) -> Cycle {
+    let feet = |i: usize| ground(&((track.ankles[0][i] + track.ankles[1][i]) / 2.0));
+    let leap = feet(events.landing) - feet(events.take_off);
+    let length_m = (feet(events.end) - feet(events.start)).norm();
+    let direction = if leap.norm() > 0.15 * track.hip_height_m { leap } else { facing(&track.poses[events.start]) };
+    let heading = yaw(&direction);
+    let (from, to) = (events.start as f64, events.end as f64);
+    let poses: Vec<Pose> = (0..SAMPLES).map(|k| track.pose_at(from + (to - from) * k as f64 / (SAMPLES - 1) as f64)).collect();
+    let h = track.hip_height_m;
+    let floor_m = track.floor_m(events.start..events.take_off.max(events.start + 1));
+    let carrier = Vector3::new(poses[0].root.x, floor_m + h, poses[0].root.z);
+    let carrier_from_world = exp(&Vector3::new(0.0, -heading, 0.0));
+    Cycle {
+        subject: label.subject.clone(),
+        source: track.place_name(label, from, to),
+        activity: label.activity,
+        parameter: label.parameter.unwrap_or(length_m),
+        hip_height_m: h,
+        duration_s: (to - from) / track.fps,
+        joints: poses.iter().map(|p| p.joints).collect(),
+        root: poses
+            .iter()
+            .map(|p| RootSample {
+                rotation: log(&(carrier_from_world * p.world_from_root)),
+                position: carrier_from_world * (p.root - carrier) / h,
+            })
+            .collect(),
+    }
+}

@@ -1,0 +1,194 @@
+//! From anatomical angles to joint rotations, and from leg rotations to where the soles are.
+//!
+//! Signs, with the body's x left, y up, z forward: flexion of hip and elbow, and of the shoulder (arm forward) turn by −x,
+//! of the knee by +x, dorsiflexion by −x; rotations about y and z have opposite signs on the two sides.
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::variation::{Channel, TRACKS, track};
+use crate::body::{BALL_JOINTS, Joint, NODES};
+use crate::math::rotation::{exp, log};
+
+/// Share of the trunk's bending that each joint of the spine takes, from the pelvis up.
+const SPINE: [(Joint, f64); 5] = [(Joint::Vl5, 0.20), (Joint::Vl1, 0.25), (Joint::Vt10, 0.25), (Joint::Vt5, 0.20), (Joint::Vt1, 0.10)];
+/// Heel behind the ankle; heel, ball and toe tip of the sole under their joints: fractions of stature.
+const HEEL_BACK: f64 = 0.040;
+const ANKLE_HEIGHT: f64 = 0.039;
+const BALL_HEIGHT: f64 = 0.020;
+const TOE_FORWARD: f64 = 0.055;
+/// Lowest points of a foot: heel, ball, toe tip.
+pub(super) const SOLE_POINTS: usize = 3;
+/// The sole points of both feet, left first, relative to the root, metres.
+pub(super) type Soles = [[Vector3<f64>; SOLE_POINTS]; 2];
+
+/// Angles of one side, radians.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Side {
+    pub hip_flexion: f64,
+    /// Rotation of the whole leg about the body's forward axis against the vertical: positive carries the foot to the left.
+    pub leg_lateral: f64,
+    pub hip_rotation: f64,
+    pub knee: f64,
+    pub ankle: f64,
+    pub toe_out: f64,
+    pub toe: f64,
+    pub shoulder: f64,
+    pub shoulder_abduction: f64,
+    pub elbow: f64,
+}
+
+/// Anatomical angles of one instant, radians. Pelvis and thorax are given against the carrier, so that the spine
+/// counter-rotates by itself.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Angles {
+    pub sides: [Side; 2],
+    pub tilt: f64,
+    pub list: f64,
+    pub yaw: f64,
+    pub lean: f64,
+    pub bend: f64,
+    pub torsion: f64,
+}
+
+impl Angles {
+    /// From one sample of the tracks; toe and lateral position of the legs are left at rest.
+    pub fn from_tracks(deg: &[f64; TRACKS]) -> Angles {
+        let get = |channel, side| deg[track(channel, side)].to_radians();
+        let side = |s| Side {
+            hip_flexion: get(Channel::HipFlexion, s),
+            knee: above_zero(get(Channel::Knee, s), 3f64.to_radians()),
+            ankle: get(Channel::Ankle, s),
+            toe_out: -get(Channel::HipRotation, s),
+            shoulder: get(Channel::Shoulder, s),
+            shoulder_abduction: get(Channel::ShoulderAbduction, s),
+            elbow: above_zero(get(Channel::Elbow, s), 5f64.to_radians()),
+            ..Side::default()
+        };
+        Angles {
+            sides: [side(0), side(1)],
+            tilt: get(Channel::Tilt, 0),
+            list: get(Channel::List, 0),
+            yaw: get(Channel::Yaw, 0),
+            lean: get(Channel::Lean, 0),
+            bend: get(Channel::Bend, 0),
+            torsion: get(Channel::Torsion, 0),
+        }
+    }
+
+    pub fn carrier_from_root(&self) -> UnitQuaternion<f64> {
+        yaw(self.yaw) * list(self.list) * pitch(self.tilt)
+    }
+
+    pub fn joints(&self) -> [UnitQuaternion<f64>; BALL_JOINTS] {
+        let mut joints = [UnitQuaternion::identity(); BALL_JOINTS];
+        let mut set = |joint: Joint, rotation| joints[joint as usize - 1] = rotation;
+        let carrier_from_thorax = yaw(self.torsion) * list(self.bend) * pitch(self.lean);
+        let spine = log(&(self.carrier_from_root().inverse() * carrier_from_thorax));
+        for (joint, share) in SPINE {
+            set(joint, exp(&(spine * share)));
+        }
+        // The head looks ahead: it takes little of the trunk's turning and leaning.
+        let carrier_from_head = yaw(0.3 * self.torsion) * list(0.3 * self.bend) * pitch(0.3 * self.lean);
+        let neck = exp(&(log(&(carrier_from_thorax.inverse() * carrier_from_head)) * 0.5));
+        set(Joint::Vc4, neck);
+        set(Joint::Skullbase, neck);
+        for (s, names) in SIDES.iter().enumerate() {
+            let leg = self.leg(s);
+            set(names.hip, leg[0]);
+            set(names.knee, leg[1]);
+            set(names.ankle, leg[2]);
+            set(names.midtarsal, leg[3]);
+            let side = &self.sides[s];
+            let sign = if s == 0 { 1.0 } else { -1.0 };
+            set(names.clavicle, yaw(-sign * 0.1 * side.shoulder));
+            set(names.shoulder, pitch(-side.shoulder) * list(sign * side.shoulder_abduction) * yaw(-sign * 0.25 * side.elbow));
+            set(names.elbow, pitch(-side.elbow));
+            set(names.wrist, pitch(-0.1 * side.elbow));
+        }
+        joints
+    }
+
+    /// Rotations of hip, knee, ankle and midtarsal joint of one side.
+    fn leg(&self, s: usize) -> [UnitQuaternion<f64>; 4] {
+        let side = &self.sides[s];
+        let sign = if s == 0 { 1.0 } else { -1.0 };
+        let hip = list(side.leg_lateral - self.list) * pitch(-side.hip_flexion) * yaw(-sign * side.hip_rotation - self.yaw);
+        let ankle = list(-side.leg_lateral) * yaw(sign * side.toe_out) * pitch(-side.ankle);
+        [hip, pitch(side.knee), ankle, pitch(-side.toe)]
+    }
+
+    /// Sole points relative to the root, and the pitch of both feet (toes up positive).
+    pub fn soles(&self, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> (Soles, [f64; 2]) {
+        let mut soles = [[Vector3::zeros(); SOLE_POINTS]; 2];
+        let mut pitches = [0.0; 2];
+        for (s, names) in SIDES.iter().enumerate() {
+            let [hip, knee, ankle, toe] = self.leg(s);
+            let rotation = self.carrier_from_root();
+            let at_hip = rotation * (offsets[Joint::Sacroiliac as usize] + offsets[names.hip as usize]);
+            let rotation = rotation * hip;
+            let at_knee = at_hip + rotation * offsets[names.knee as usize];
+            let rotation = rotation * knee;
+            let at_ankle = at_knee + rotation * offsets[names.ankle as usize];
+            let rotation = rotation * ankle;
+            let at_ball = at_ankle + rotation * offsets[names.midtarsal as usize];
+            pitches[s] = (rotation * Vector3::z()).y.asin();
+            soles[s] = [
+                at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
+                at_ball + rotation * (Vector3::new(0.0, -BALL_HEIGHT, 0.0) * stature_m),
+                at_ball + rotation * toe * (Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD) * stature_m),
+            ];
+        }
+        (soles, pitches)
+    }
+}
+
+struct SideJoints {
+    hip: Joint,
+    knee: Joint,
+    ankle: Joint,
+    midtarsal: Joint,
+    clavicle: Joint,
+    shoulder: Joint,
+    elbow: Joint,
+    wrist: Joint,
+}
+
+const SIDES: [SideJoints; 2] = [
+    SideJoints {
+        hip: Joint::LHip,
+        knee: Joint::LKnee,
+        ankle: Joint::LAnkle,
+        midtarsal: Joint::LMidtarsal,
+        clavicle: Joint::LSternoclavicular,
+        shoulder: Joint::LShoulder,
+        elbow: Joint::LElbow,
+        wrist: Joint::LWrist,
+    },
+    SideJoints {
+        hip: Joint::RHip,
+        knee: Joint::RKnee,
+        ankle: Joint::RAnkle,
+        midtarsal: Joint::RMidtarsal,
+        clavicle: Joint::RSternoclavicular,
+        shoulder: Joint::RShoulder,
+        elbow: Joint::RElbow,
+        wrist: Joint::RWrist,
+    },
+];
+
+fn pitch(angle: f64) -> UnitQuaternion<f64> {
+    exp(&Vector3::new(angle, 0.0, 0.0))
+}
+
+fn yaw(angle: f64) -> UnitQuaternion<f64> {
+    exp(&Vector3::new(0.0, angle, 0.0))
+}
+
+fn list(angle: f64) -> UnitQuaternion<f64> {
+    exp(&Vector3::new(0.0, 0.0, angle))
+}
+
+/// Smooth maximum of `x` and 0 that rounds the corner over about `corner`: knees and elbows do not bend backwards.
+pub(super) fn above_zero(x: f64, corner: f64) -> f64 {
+    0.5 * (x + (x * x + corner * corner).sqrt())
+}
