@@ -1,7 +1,7 @@
 //! `muybridge clouds`: a session's point clouds as PLY files.
 
+use super::progress;
 use anyhow::{Context, Result, bail};
-use indicatif::{ProgressBar, ProgressStyle};
 use muybridge::clouds::{CloudOptions, CloudRig};
 use muybridge::io::ply::write_ply;
 use muybridge::io::session::Session;
@@ -38,8 +38,7 @@ pub fn run(args: &CloudsArgs) -> Result<()> {
     }
     let rig = CloudRig::new(&session.rig, session.backgrounds.as_deref(), &options)
         .with_context(|| format!("the rig of {}", args.session.display()))?;
-    let bar = ProgressBar::new(session.frame_count as u64)
-        .with_style(ProgressStyle::with_template("clouds {bar:40} {pos}/{len} {eta}").unwrap_or_else(|_| ProgressStyle::default_bar()));
+    let progress = progress::bar("clouds", session.frame_count as u64);
     let (mut points, mut seen) = (0, 0);
     for frame in session.frames() {
         let frame = frame?;
@@ -47,9 +46,9 @@ pub fn run(args: &CloudsArgs) -> Result<()> {
         write_ply(&args.output.join(format!("{:06}.ply", frame.number)), &cloud)?;
         points += cloud.points.len();
         seen += usize::from(!cloud.points.is_empty());
-        bar.inc(1);
+        progress.inc(1);
     }
-    bar.finish_and_clear();
+    progress.finish();
     if seen == 0 {
         bail!(
             "{}: nobody is in view in any of the {} frames; check that the pictures show a person that the stage pictures do not",

@@ -1,8 +1,8 @@
 //! One file per subcommand: load, call the library, save, report.
 mod clouds;
 
-mod progress;
 mod disparity;
+mod progress;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
