@@ -1,4 +1,5 @@
 //! One file per subcommand: load, call the library, save, report.
+mod clouds;
 
 mod disparity;
 mod generate;
@@ -6,6 +7,7 @@ mod model;
 mod motions;
 mod progress;
 mod render;
+mod progress;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -22,6 +24,8 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// The person's point cloud in every frame of a session, as PLY files
+    Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
     /// Motion databases and their PCA models
@@ -37,6 +41,7 @@ enum Command {
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
+        Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Model(command) => model::run(command),

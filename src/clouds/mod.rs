@@ -13,5 +13,5 @@ pub mod triangulate;
 pub mod validate;
 
 pub use cloud::{Cloud, CloudPoint};
-pub use frame::{CloudError, CloudOptions, FrameCloud, frame_cloud};
+pub use frame::{CloudError, CloudOptions, CloudRig, FrameCloud, frame_cloud};
 pub use stage::Stage;

@@ -63,11 +63,11 @@ pub(crate) struct StageView {
 
 impl Stage {
     /// Matches the pictures of the empty stage, one per camera of the rig, up to the largest disparity.
-    pub(crate) fn new(rectification: &Rectification, images: &[&GrayImage], largest_px: usize, options: &StereoOptions) -> Self {
+    pub(crate) fn measure(rectification: &Rectification, images: &[&GrayImage], largest_px: usize, options: &StereoOptions) -> Self {
         let prepared: Vec<PreparedView> =
             (0..images.len()).map(|k| PreparedView::new(rectification.warp(k, images[k]), rectification.views[k].step)).collect();
         let regions = vec![whole(rectification); prepared.len()];
-        let found = match_views(&prepared, &regions, [0, largest_px], options, &[]);
+        let found = match_views(&prepared, &regions, [0, largest_px], options);
         let views = prepared.into_iter().zip(found).map(|(p, f)| StageView { plane: p.plane, disparity: fill_gaps(&f.disparity) });
         Self { views: views.collect() }
     }
@@ -138,13 +138,32 @@ pub(crate) fn compare(now: &Plane, stage: &Plane, options: &StageOptions) -> Cha
     let squares: Vec<f32> = ratio.iter().zip(&coarse).map(|(r, c)| (r - c).powi(2)).collect();
     let roughness: Vec<f32> = blur(&squares, width, 1.5).into_iter().map(f32::sqrt).collect();
     let smooth = options.shade_roughness * median(roughness.iter().copied(), &known);
+    let step = 4.0 * 1.4826 * median(ratio.iter().zip(ratio.iter().skip(1)).map(|(a, b)| (a - b).abs()), &known);
     let mask = |set: &dyn Fn(usize) -> bool| {
         GrayImage::from_fn(now.width(), now.height(), |x, y| Luma([if set(y as usize * width + x as usize) { 255 } else { 0 }]))
     };
     let changed = mask(&|i| difference[i].abs() > options.change_sigmas * noise);
-    let shaded = mask(&|i| roughness[i] < smooth && coarse[i] < 0.0 && coarse[i] > DARKEST_SHADE);
+    let mut shaded = mask(&|i| roughness[i] < smooth && coarse[i] < 0.0 && coarse[i] > DARKEST_SHADE);
+    grow_shade(&mut shaded, &ratio, step);
     Change { difference, changed, shaded }
 }
+
+/// Roughness reaches a few pixels beyond an outline; there the shadow grows over small steps of the ratio.
+fn grow_shade(shaded: &mut GrayImage, ratio: &[f32], largest_step: f32) {
+    let (width, height) = (shaded.width() as usize, shaded.height() as usize);
+    for _ in 0..GROWTH_PX {
+        let before = shaded.as_raw().clone();
+        for i in width..(width * height).saturating_sub(width + 1) {
+            let joins = |j: usize| before[j] != 0 && (ratio[i] - ratio[j]).abs() < largest_step;
+            if before[i] == 0 && ratio[i] < 0.0 && (joins(i - 1) || joins(i + 1) || joins(i - width) || joins(i + width)) {
+                shaded.put_pixel((i % width) as u32, (i / width) as u32, Luma([255]));
+            }
+        }
+    }
+}
+
+/// The reach of the roughness measure.
+const GROWTH_PX: usize = 5;
 
 /// Against noise; wider moves the outline.
 const DIFFERENCE_SIGMA_PX: f32 = 0.7;

@@ -35,7 +35,7 @@ pub fn remove_outliers(cloud: Cloud) -> Cloud {
     let spreads: Vec<f64> = cloud.points.iter().zip(&places).map(spread).collect();
     let middle = median(spreads.clone());
     let deviation = 1.4826 * median(spreads.iter().map(|s| (s - middle).abs()).collect());
-    let limit = middle + OUTLIER_LIMIT * deviation.max(0.05 * middle);
+    let limit = middle + OUTLIER_LIMIT * deviation.max(0.15 * middle);
     Cloud { points: cloud.points.into_iter().zip(spreads).filter(|(_, s)| *s <= limit).map(|(p, _)| p).collect() }
 }
 

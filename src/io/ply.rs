@@ -116,8 +116,8 @@ mod tests {
         let path = folder.path().join("a.ply");
         write_ply(&path, &cloud()).unwrap();
         let good = std::fs::read(&path).unwrap();
-        let text = String::from_utf8_lossy(&good[..300]).into_owned();
-        let header = &text[..text.find("end_header").unwrap()];
+        let end = good.windows(10).position(|w| w == b"end_header").unwrap();
+        let header = std::str::from_utf8(&good[..end]).unwrap();
         let swap = |a: &str, b: &str| [header.replace(a, b).as_bytes(), &good[header.len()..]].concat();
         let broken = [
             good[..good.len() - 3].to_vec(),
