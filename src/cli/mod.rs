@@ -2,7 +2,6 @@
 
 mod progress;
 mod disparity;
-mod progress;
 mod render;
 
 use anyhow::Result;
