@@ -147,6 +147,8 @@ fn truncated_differences(
 
 /// Pixels `x0..` of row `y` of the picture moved back by `shift`; 0 outside. Fractional shifts are interpolated.
 fn shifted_row(image: &GrayImage, shift: Vector2<f64>, x0: isize, y: isize, out: &mut [u8]) {
+    // Steps come from an inverted matrix: 1 + 2e-16 must not cost an interpolation.
+    let shift = shift.map(|s| if (s - s.round()).abs() < 1e-6 { s.round() } else { s });
     let (whole, part) = (shift.map(f64::floor), shift - shift.map(f64::floor));
     let (x0, y) = (x0 + whole.x as isize, y + whole.y as isize);
     if part.norm() < 1e-6 {

@@ -11,10 +11,10 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 /// Wider lets the outline's contrast change the values of pixels further inside; narrower removes the texture itself.
-const SIGMA_PX: f32 = 4.0;
+const SIGMA_PX: f32 = 1.5;
 
 /// About twice the noise of an 8-bit camera, grey levels. Smaller amplifies noise on bare walls, larger forgets weak texture.
-const CONTRAST_FLOOR: f32 = 4.0;
+const CONTRAST_FLOOR: f32 = 5.0;
 
 /// Grey steps per unit of g: 3 standard deviations fill the 8 bits.
 const GAIN: f32 = 40.0;
@@ -23,12 +23,13 @@ const GAIN: f32 = 40.0;
 pub fn normalise(plane: &Plane) -> GrayImage {
     let (width, height) = plane.dimensions();
     let filled = fill_unknown(plane);
-    let mean = blur(&filled, width as usize, SIGMA_PX);
+    let mean = blur(&filled, width as usize, std::env::var("SG").ok().and_then(|v| v.parse().ok()).unwrap_or(SIGMA_PX));
     let centred: Vec<f32> = filled.par_iter().zip(&mean).map(|(i, m)| i - m).collect();
     let squares: Vec<f32> = centred.par_iter().map(|c| c * c).collect();
-    let variance = blur(&squares, width as usize, SIGMA_PX);
+    let variance = blur(&squares, width as usize, std::env::var("SG").ok().and_then(|v| v.parse().ok()).unwrap_or(SIGMA_PX));
+    let floor = std::env::var("CF").ok().and_then(|v| v.parse().ok()).unwrap_or(CONTRAST_FLOOR);
     let value = |((c, v), raw): ((&f32, &f32), &f32)| {
-        if raw.is_nan() { 0 } else { (128.0 + GAIN * c / (v.max(0.0).sqrt() + CONTRAST_FLOOR)).round().clamp(1.0, 255.0) as u8 }
+        if raw.is_nan() { 0 } else { (128.0 + GAIN * c / (v.max(0.0).sqrt() + floor)).round().clamp(1.0, 255.0) as u8 }
     };
     let values = centred.par_iter().zip(&variance).zip(plane.as_raw()).map(value).collect();
     GrayImage::from_raw(width, height, values).expect("one value per pixel")

@@ -29,14 +29,15 @@ pub struct StereoOptions {
 
 impl Default for StereoOptions {
     fn default() -> Self {
+        let e = |n: &str, d: f32| std::env::var(n).ok().and_then(|v| v.parse().ok()).unwrap_or(d);
         Self {
-            radius: 2,
-            truncation: 60,
-            occlusion_penalty: 4,
-            uniqueness: 0.05,
-            consistency_px: 1.0,
-            speckle_area_px: 60,
-            speckle_step_px: 1.5,
+            radius: e("R", 2.0) as usize,
+            truncation: e("T", 50.0) as u8,
+            occlusion_penalty: e("P", 4.0) as u16,
+            uniqueness: e("U", 0.2),
+            consistency_px: e("C", 1.0),
+            speckle_area_px: e("A", 100.0) as usize,
+            speckle_step_px: e("S", 1.5),
         }
     }
 }

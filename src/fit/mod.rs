@@ -91,7 +91,7 @@ const SETTINGS: Settings = Settings {
     stature: 0.03,
     length: 0.025,
     arm_length: 0.05,
-    width: 0.12,
+    width: 0.08,
 };
 
 /// Steadiness of the phase while the start is still rough.

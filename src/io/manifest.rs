@@ -8,10 +8,9 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::is_motion_file;
 use crate::motion_model::Activity;
 
-/// File endings of motion files, lower case.
-pub const ENDINGS: [&str; 3] = ["amc", "bvh", "mot"];
 const MANIFEST: &str = "subjects.csv";
 
 /// One motion, or part of one.
@@ -37,7 +36,7 @@ pub enum ManifestError {
     Column { path: PathBuf, column: String },
     #[error("{path} line {line}: {why}")]
     Row { path: PathBuf, line: usize, why: String },
-    #[error("no motion file (.amc, .bvh, .mot) in {path}")]
+    #[error("no motion file (.amc, .bvh, .mot, .sto) in {path}")]
     Nothing { path: PathBuf },
 }
 
@@ -74,15 +73,11 @@ fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -
     let mut children: Vec<PathBuf> = fs::read_dir(path).map_err(failed)?.filter_map(|e| Some(e.ok()?.path())).collect();
     children.sort_by(|a, b| natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then(a.cmp(b)));
     for child in children {
-        if child.is_dir() || has_motion_ending(&child) {
+        if child.is_dir() || is_motion_file(&child) {
             search(&child, entries, seen)?;
         }
     }
     Ok(())
-}
-
-fn has_motion_ending(path: &Path) -> bool {
-    path.extension().is_some_and(|e| ENDINGS.contains(&e.to_string_lossy().to_lowercase().as_str()))
 }
 
 fn plain(path: &Path) -> Entry {

@@ -4,8 +4,8 @@
 //!   world_from_ours(t) = W G(t) B A,                                                                 (1)
 //! W: the smallest rotation of the source's up axis onto y; B: source_from_body at rest (x left, y up, z forward,
 //! snapped to the axes); A: the smallest rotation of our hanging limb onto the source's limb at rest, both in body axes,
-//! so that thighs, shanks, arms and hands point exactly where the source's do. Feet are turned about the vertical only:
-//! both skeletons rest on flat soles however high their ankles sit. Pelvis, trunk, neck, head and clavicles: A = 1.
+//! so that thighs, shanks, arms and hands point exactly where the source's do. Feet keep their pitch: both skeletons rest on
+//! flat soles however high their ankles sit; they lean with a straddled leg (CMU's rest pose) and turn to the source's toes. Pelvis, trunk, neck, head and clavicles: A = 1.
 //!
 //! Only limbs and head are found by name; pelvis, trunk, neck and clavicles follow from the hierarchy between them.
 //! Skeletons whose zero pose is no standing person (bones along one axis) use their most upright frame instead; then
@@ -84,10 +84,11 @@ pub fn clip_from_recording(recording: &Recording) -> Result<(Clip, Vec<String>),
     let mut notices = Vec::new();
     let first = first_frame(recording, &anatomy);
     if first > 0 {
-        notices.push("dropped frame 0, a rest pose unconnected with the motion".to_string());
+        let which = if first == 1 { "frame 0".to_string() } else { format!("frames 0 to {}", first - 1) };
+        notices.push(format!("dropped {which}: a rest pose and the jump from it into the motion"));
     }
+    check_root(recording, first, &anatomy, scale, &mut notices)?;
     let frames = &recording.frames[first..];
-    check_root(frames, first, &anatomy, recording.fps, scale, &mut notices)?;
     let rest = Rest::find(recording, frames, &anatomy, &mut notices)?;
     let shape = measured_shape(&rest.positions, &anatomy, scale);
     let ours_from_source = between(&rest.world_up, &Vector3::y());
@@ -337,33 +338,34 @@ fn unit_of_leg(leg: f64) -> Result<f64, MappingError> {
     }
 }
 
-/// 1 if frame 0 is a rest pose put before the motion: from it the pose jumps four times as far as in any of the next steps.
+/// The first frame of the motion proper. Frame 0 is a rest pose put before it if the pose then jumps 2.5 times as far as 95 %
+/// of all steps do; smoothed files blend over to the motion in a few frames, which go too.
 fn first_frame(recording: &Recording, anatomy: &Anatomy) -> usize {
-    let step = |i: usize| -> Option<f64> {
-        let (a, b) = (recording.frames.get(i)?, recording.frames.get(i + 1)?);
-        let angle = |&j: &usize| a.rotations[j].angle_to(&b.rotations[j]);
-        Some(anatomy.of.iter().flatten().map(angle).fold(0.0, f64::max))
+    let step = |pair: &[RecordedFrame]| {
+        let angle = |&j: &usize| pair[0].rotations[j].angle_to(&pair[1].rotations[j]);
+        anatomy.of.iter().flatten().map(angle).fold(0.0, f64::max)
     };
-    let next = (1..11).filter_map(step).fold(0.0, f64::max);
-    usize::from(step(0).is_some_and(|s| recording.frames.len() > 2 && s > 10f64.to_radians() && s > 4.0 * next))
+    let steps: Vec<f64> = recording.frames.windows(2).map(step).collect();
+    let usual = quantile(&mut steps.clone(), 0.95);
+    match steps.first() {
+        Some(&first) if steps.len() > 20 && first > 10f64.to_radians() && first > 2.5 * usual => {
+            steps.iter().take_while(|&&s| s > usual).count()
+        }
+        _ => 0,
+    }
 }
 
-fn check_root(
-    frames: &[RecordedFrame],
-    first: usize,
-    anatomy: &Anatomy,
-    fps: f64,
-    scale: f64,
-    notices: &mut Vec<String>,
-) -> Result<(), MappingError> {
+/// Hips that jump are an error; between frames that are dropped anyway only by more than half a metre.
+fn check_root(recording: &Recording, first: usize, anatomy: &Anatomy, scale: f64, notices: &mut Vec<String>) -> Result<(), MappingError> {
     let mut doubtful = None;
-    for (i, pair) in frames.windows(2).enumerate() {
+    for (frame, pair) in recording.frames.windows(2).enumerate().skip(first.min(1)) {
         let distance_m = scale * (anatomy.hips(&pair[1].positions) - anatomy.hips(&pair[0].positions)).norm();
-        if distance_m * fps > BROKEN_SPEED && distance_m > 0.1 {
-            return Err(MappingError::RootJump { frame: first + i, distance_m });
+        let (speed, kept) = (distance_m * recording.fps, frame >= first);
+        if speed > BROKEN_SPEED && distance_m > if kept { 0.1 } else { 0.5 } {
+            return Err(MappingError::RootJump { frame, distance_m });
         }
-        if distance_m * fps > DOUBTFUL_SPEED && doubtful.is_none() {
-            doubtful = Some((first + i, distance_m * fps));
+        if kept && speed > DOUBTFUL_SPEED && doubtful.is_none() {
+            doubtful = Some((frame, speed));
         }
     }
     if let Some((frame, speed)) = doubtful {
@@ -389,7 +391,7 @@ impl Rest {
         let up: Vector3<f64> = frames.iter().map(|f| anatomy.up(&f.positions).normalize()).sum();
         let world_up = nearest_axis(&up);
         let zero = zero_positions(&recording.joints);
-        if uprightness(anatomy, &zero, &anatomy.up(&zero)) > 0.9 {
+        if uprightness(anatomy, &zero, &anatomy.up(&zero)) > 0.8 {
             let left = zero[anatomy.at(Joint::LHip)] - zero[anatomy.at(Joint::RHip)];
             let source_from_body = body_axes(&left, &anatomy.up(&zero), true)?;
             let rotations = vec![UnitQuaternion::identity(); zero.len()];
@@ -457,6 +459,7 @@ fn measured_shape(rest: &[Vector3<f64>], anatomy: &Anatomy, scale: f64) -> Shape
 fn alignments(joints: &[RecordedJoint], anatomy: &Anatomy, rest: &Rest) -> [UnitQuaternion<f64>; NODES] {
     use Joint::*;
     let body_from_source = rest.source_from_body.inverse();
+    let bent = joints.iter().any(|j| plain_name(&j.name).contains("shldr"));
     let mut of = [UnitQuaternion::identity(); NODES];
     for (upper, lower) in [(LHip, LKnee), (LKnee, LAnkle), (LShoulder, LElbow), (LElbow, LWrist)] {
         for (upper, lower) in [(upper, lower), (upper.mirror(), lower.mirror())] {
@@ -470,26 +473,35 @@ fn alignments(joints: &[RecordedJoint], anatomy: &Anatomy, rest: &Rest) -> [Unit
             }
         }
     }
+    if bent {
+        for (upper, lower) in [(LHip, LKnee), (LShoulder, LElbow), (RHip, RKnee), (RShoulder, RElbow)] {
+            of[lower as usize] = of[upper as usize];
+        }
+    }
     for (elbow, wrist) in [(LElbow, LWrist), (RElbow, RWrist)] {
         let source = anatomy.of[wrist as usize].and_then(|w| bone(joints, w, rest));
         of[wrist as usize] = source.map_or(of[elbow as usize], |d| between(&-Vector3::y(), &(body_from_source * d)));
     }
-    for (ankle, ball) in [(LAnkle, LMidtarsal), (RAnkle, RMidtarsal)] {
+    for (knee, ankle, ball) in [(LKnee, LAnkle, LMidtarsal), (RKnee, RAnkle, RMidtarsal)] {
         let a = anatomy.at(ankle);
         let source = anatomy.of[ball as usize].map(|b| rest.positions[b] - rest.positions[a]).or_else(|| bone(joints, a, rest));
-        let foot = source.map_or(UnitQuaternion::identity(), |d| foot_alignment(ankle, ball, &(body_from_source * d), rest.flat_soles));
+        let shank = body_from_source * (rest.positions[a] - rest.positions[anatomy.at(knee)]);
+        let foot = source.map_or(UnitQuaternion::identity(), |d| {
+            let toes = body_from_source * d;
+            if rest.flat_soles { flat_foot(&shank, &toes) } else { between(&(ball.rest_position() - ankle.rest_position()), &toes) }
+        });
         of[ankle as usize] = foot;
         of[ball as usize] = foot;
     }
     of
 }
 
-fn foot_alignment(ankle: Joint, ball: Joint, source: &Vector3<f64>, flat_soles: bool) -> UnitQuaternion<f64> {
-    if !flat_soles {
-        return between(&(ball.rest_position() - ankle.rest_position()), source);
-    }
-    let level = Vector3::new(source.x, 0.0, source.z);
-    if level.norm() > 0.3 * source.norm() { between(&Vector3::z(), &level) } else { UnitQuaternion::identity() }
+/// Our foot, flat but leaning sideways with the shank, turned about its vertical until it points like the source's.
+fn flat_foot(shank: &Vector3<f64>, toes: &Vector3<f64>) -> UnitQuaternion<f64> {
+    let lean = between(&-Vector3::y(), &Vector3::new(shank.x, shank.y, 0.0));
+    let toes = lean.inverse() * toes;
+    let level = Vector3::new(toes.x, 0.0, toes.z);
+    if level.norm() > 0.3 * toes.norm() { lean * between(&Vector3::z(), &level) } else { lean }
 }
 
 /// Direction of the bone that hangs on a joint at rest: to its end, or to the middle of its children but the thumb.

@@ -29,6 +29,8 @@ pub struct Synthesis {
     pub hip_height_m: f64,
     /// Cycles (jumps) per second.
     pub frequency_hz: f64,
+    /// Database subjects and their weights in equation (8).
+    pub shares: Vec<(String, f64)>,
     pub notice: Option<String>,
 }
 
@@ -52,7 +54,7 @@ pub fn synthesize(
     let at_own_size = parameter * style.hip_height_m / hip_height_m;
     let found = extrapolate(population, metric, &style.weights, style.parameter, at_own_size)?;
     let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(parameter, hip_height_m);
-    Ok(Synthesis { weights: found.weights, parameter, hip_height_m, frequency_hz, notice: found.notice })
+    Ok(Synthesis { weights: found.weights, parameter, hip_height_m, frequency_hz, shares: found.shares, notice: found.notice })
 }
 
 /// Plays at `fps` from the start of a cycle; `offsets` are those of the body that moves.

@@ -61,7 +61,7 @@ pub enum ModelError {
     TooFew(usize),
     #[error("{origin} has {found} samples, a cycle has {SAMPLES}")]
     Samples { origin: String, found: usize },
-    #[error("{origin} is {found:?}, the model is for {wanted:?}")]
+    #[error("{origin} is {found}, the model is for {wanted}")]
     Activity { origin: String, found: Activity, wanted: Activity },
     #[error("all cycles of the database are equal, there is nothing to model")]
     NoVariance,

@@ -53,6 +53,8 @@ pub struct RectifiedView {
     pub step: Vector2<f64>,
     /// Raw pixel of every rectified pixel, row by row; NaN where the camera sees nothing.
     pub map: Vec<[f32; 2]>,
+    /// Rectified pixel of every raw pixel, row by row; NaN where the distortion has no inverse.
+    pub back_map: Vec<[f32; 2]>,
 }
 
 /// Two or three views on one image plane; `views[0]` is the reference.
@@ -130,6 +132,13 @@ impl Rectification {
     pub fn warp(&self, view: usize, raw: &GrayImage) -> Plane {
         let values = self.views[view].map.par_iter().map(|&[x, y]| bicubic(raw, x, y)).collect();
         ImageBuffer::from_raw(self.size_px[0], self.size_px[1], values).expect("one map entry per pixel")
+    }
+
+    /// A rectified 0/255 mask on the grid of a view's raw picture; 0 outside the canvas.
+    pub fn unwarp(&self, view: usize, mask: &GrayImage) -> GrayImage {
+        let [width, height] = self.views[view].camera.size_px;
+        let values = self.views[view].back_map.par_iter().map(|&[x, y]| if bilinear(mask, x, y) >= 127.5 { 255 } else { 0 }).collect();
+        ImageBuffer::from_raw(width, height, values).expect("one map entry per pixel")
     }
 
     fn pixel_of_direction(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {
@@ -310,8 +319,13 @@ fn draw(rig: &Rig, layout: Layout) -> Rectification {
         let b = layout.plane_from_world * (c.centre() - cameras[0].centre());
         -(layout.pixel_from_plane * Vector2::new(b.x, b.y)) / layout.baseline_m
     };
-    let views =
-        layout.order.iter().zip(&cameras).map(|(&index, &c)| RectifiedView { index, camera: c.clone(), step: step(c), map: Vec::new() });
+    let views = layout.order.iter().zip(&cameras).map(|(&index, &c)| RectifiedView {
+        index,
+        camera: c.clone(),
+        step: step(c),
+        map: Vec::new(),
+        back_map: Vec::new(),
+    });
     let mut rectification = Rectification {
         size_px: [0, 0],
         focal_px: cameras.iter().map(focal).sum::<f64>() / cameras.len() as f64,
@@ -325,6 +339,7 @@ fn draw(rig: &Rig, layout: Layout) -> Rectification {
     choose_canvas(&mut rectification);
     for view in 0..rectification.views.len() {
         rectification.views[view].map = warp_map(&rectification, view);
+        rectification.views[view].back_map = back_map(&rectification, view);
     }
     rectification
 }
@@ -369,6 +384,12 @@ fn warp_map(rectification: &Rectification, view: usize) -> Vec<[f32; 2]> {
     pixels.map(|p| raw(p).unwrap_or([f32::NAN; 2])).collect()
 }
 
+fn back_map(rectification: &Rectification, view: usize) -> Vec<[f32; 2]> {
+    let [width, height] = rectification.views[view].camera.size_px;
+    let pixels = (0..height).into_par_iter().flat_map_iter(|v| (0..width).map(move |u| Point2::new(f64::from(u), f64::from(v))));
+    pixels.map(|raw| rectification.rectified_pixel(view, &raw).map_or([f32::NAN; 2], |p| [p.x as f32, p.y as f32])).collect()
+}
+
 /// Catmull-Rom interpolation with replicated borders; NaN at NaN.
 fn bicubic(image: &GrayImage, x: f32, y: f32) -> f32 {
     if x.is_nan() {
@@ -392,4 +413,16 @@ fn bicubic(image: &GrayImage, x: f32, y: f32) -> f32 {
 fn catmull_rom(t: f32) -> [f32; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+}
+
+/// Bilinear interpolation; 0 outside and at NaN.
+fn bilinear(image: &GrayImage, x: f32, y: f32) -> f32 {
+    let (width, height) = (image.width() as f32, image.height() as f32);
+    if !(x >= 0.0 && y >= 0.0 && x <= width - 1.0 && y <= height - 1.0) {
+        return 0.0;
+    }
+    let (x0, y0) = (x as u32, y as u32);
+    let (tx, ty) = (x - x0 as f32, y - y0 as f32);
+    let at = |i: u32, j: u32| f32::from(image.get_pixel((x0 + i).min(image.width() - 1), (y0 + j).min(image.height() - 1)).0[0]);
+    (1.0 - ty) * ((1.0 - tx) * at(0, 0) + tx * at(1, 0)) + ty * ((1.0 - tx) * at(0, 1) + tx * at(1, 1))
 }
