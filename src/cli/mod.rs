@@ -5,8 +5,10 @@ mod disparity;
 mod generate;
 mod model;
 mod motions;
+mod observe;
 mod progress;
 mod render;
+mod track;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -32,6 +34,8 @@ enum Command {
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
+    /// A session's footage to the person's motion, style and size
+    Track(track::TrackArgs),
     /// Phantom footage of a motion file before a rig, with its truth
     Render(render::RenderArgs),
 }
@@ -42,6 +46,7 @@ pub fn run(cli: Cli) -> Result<()> {
     match cli.command {
         Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
+        Command::Track(args) => track::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),

@@ -43,18 +43,9 @@ pub fn resample(clip: &Clip, fps: f64, from_s: f64, to_s: f64) -> Clip {
     let at = |k: usize| {
         let place = (from + k as f64 / fps) * clip.fps;
         let i = (place as usize).min(last);
-        between(&clip.poses[i], &clip.poses[(i + 1).min(last)], (place - i as f64).clamp(0.0, 1.0))
+        clip.poses[i].towards(&clip.poses[(i + 1).min(last)], (place - i as f64).clamp(0.0, 1.0))
     };
     Clip { fps, poses: (0..count).map(at).collect(), ..clip.clone() }
-}
-
-fn between(a: &Pose, b: &Pose, t: f64) -> Pose {
-    let turn = |p: &UnitQuaternion<f64>, q: &UnitQuaternion<f64>| p * rotation::exp(&(rotation::log(&(p.inverse() * q)) * t));
-    Pose {
-        root: a.root.lerp(&b.root, t),
-        world_from_root: turn(&a.world_from_root, &b.world_from_root),
-        joints: std::array::from_fn(|k| turn(&a.joints[k], &b.joints[k])),
-    }
 }
 
 /// Carries the clip's world to the rig's: `start_m` in floor coordinates, `heading` in radians from the first floor axis
