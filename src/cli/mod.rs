@@ -1,7 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 
-mod progress;
 mod disparity;
+mod progress;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
