@@ -11,15 +11,15 @@ pub mod images;
 
 pub mod session;
 
-pub mod video;
 pub mod bvh;
+pub mod manifest;
 pub mod mapping;
 pub mod mocap;
+pub mod model_npz;
 pub mod mot;
 pub mod sidecar;
-pub mod manifest;
-pub mod model_npz;
 pub mod style_json;
+pub mod video;
 
 pub use atomic::write_atomic;
 pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};

@@ -151,9 +151,7 @@ fn encode(model: &Model) -> std::io::Result<Vec<u8>> {
     let mut header = Header::of(model);
     header.blake3 = hash(&header, &arrays);
     let options = || {
-        zip::write::FileOptions::default()
-            .compression_method(zip::CompressionMethod::Stored)
-            .last_modified_time(zip::DateTime::default())
+        zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored).last_modified_time(zip::DateTime::default())
     };
     let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
     let json = serde_json::to_vec_pretty(&header)?;
@@ -224,7 +222,11 @@ impl<R: Read + Seek> Reader<'_, R> {
             Ok(Some(array)) => {
                 let shape = array.shape().to_vec();
                 let fits = if columns == 0 { shape.len() == 1 } else { shape.len() == 2 && shape[1] == columns as u64 };
-                if fits { array.into_vec::<f64>().map(|v| (shape[0] as usize, v)).map_err(|e| e.to_string()) } else { Err(format!("shape {shape:?}")) }
+                if fits {
+                    array.into_vec::<f64>().map(|v| (shape[0] as usize, v)).map_err(|e| e.to_string())
+                } else {
+                    Err(format!("shape {shape:?}"))
+                }
             }
             Ok(None) => Err("missing".to_string()),
             Err(e) => Err(e.to_string()),
@@ -250,7 +252,12 @@ impl<R: Read + Seek> Reader<'_, R> {
             [self.array("parameters", 0)?, self.array("hip_heights_m", 0)?, self.array("durations_s", 0)?];
         let counts = [root_members, parameters.len(), hips.len(), durations.len(), header.subjects.len(), header.sources.len()];
         let sizes = quaternions.len() == 4 * BALL_JOINTS && mean.len() == VECTOR && root_mean.len() == ROOT;
-        if !sizes || counts.iter().any(|&n| n != members) || root_components != components || components == 0 || eigenvalues.len() < components {
+        if !sizes
+            || counts.iter().any(|&n| n != members)
+            || root_components != components
+            || components == 0
+            || eigenvalues.len() < components
+        {
             return Err(self.damaged("its arrays do not fit each other"));
         }
         let model = Model {

@@ -2,7 +2,7 @@
 
 pub mod arrow;
 pub mod banded;
-pub mod pca;
 pub mod curves;
+pub mod pca;
 pub mod rotation;
 pub mod spline;

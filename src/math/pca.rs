@@ -35,10 +35,8 @@ pub fn pca(examples: &DMatrix<f64>) -> Pca {
     order.truncate((m - 1).min(d));
     let eigenvalues: Vec<f64> = order.iter().map(|&i| eigen.eigenvalues[i].max(0.0)).collect();
     let kept = eigenvalues.iter().take_while(|&&l| l > NULL_SPACE * eigenvalues[0]).count();
-    let columns: Vec<DVector<f64>> = order[..kept]
-        .iter()
-        .map(|&i| with_sign((&centred * eigen.eigenvectors.column(i)).normalize()))
-        .collect();
+    let columns: Vec<DVector<f64>> =
+        order[..kept].iter().map(|&i| with_sign((&centred * eigen.eigenvectors.column(i)).normalize())).collect();
     let basis = if columns.is_empty() { DMatrix::zeros(d, 0) } else { DMatrix::from_columns(&columns) };
     Pca { mean, basis, eigenvalues }
 }

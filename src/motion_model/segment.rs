@@ -327,8 +327,7 @@ fn largest_leg_mismatch(first: &Pose, last: &Pose) -> (Joint, f64) {
 
 /// Equation (2) on the N samples of N + 1 poses.
 fn closed_joints(poses: &[Pose]) -> Vec<[UnitQuaternion<f64>; BALL_JOINTS]> {
-    let drift: [Vector3<f64>; BALL_JOINTS] =
-        std::array::from_fn(|j| log(&(poses[0].joints[j].inverse() * poses[SAMPLES].joints[j])));
+    let drift: [Vector3<f64>; BALL_JOINTS] = std::array::from_fn(|j| log(&(poses[0].joints[j].inverse() * poses[SAMPLES].joints[j])));
     (0..SAMPLES)
         .map(|k| {
             let part = 0.5 - k as f64 / SAMPLES as f64;

@@ -95,8 +95,7 @@ mod tests {
         let population = Population::new(&model, 2);
         let alpha = |subject: usize, k: usize| model.member_weights(&model.members[4 * subject + k]);
         let observed = (alpha(0, 1) + alpha(2, 1)) * 0.45 + alpha(1, 1) * 0.1;
-        let distances: Vec<f64> =
-            (0..3).map(|p| Metric::Paper.distance(&model.eigenvalues, &observed, &alpha(p, 1))).collect();
+        let distances: Vec<f64> = (0..3).map(|p| Metric::Paper.distance(&model.eigenvalues, &observed, &alpha(p, 1))).collect();
         let w = inverse_distance_weights(&distances);
         let at = |k: usize| alpha(0, k) * w[0] + alpha(1, k) * w[1] + alpha(2, k) * w[2];
         let found = extrapolate(&population, Metric::Paper, observed.as_slice(), 1.1, 1.7).unwrap();

@@ -71,7 +71,8 @@ pub fn validate(model: &Model, variance: f64) -> Result<Validation, ModelError> 
     for (i, method) in METHODS.into_iter().enumerate() {
         for (j, metric) in METRICS.into_iter().enumerate() {
             let value = |(sum, count): (f64, f64)| if metric == "rms_deg" { (sum / count).sqrt().to_degrees() } else { sum / count };
-            let found: Vec<(&String, (f64, f64))> = subjects.iter().zip(&sums).map(|(s, r)| (s, r.sums[i][j])).filter(|f| f.1.1 > 0.0).collect();
+            let found: Vec<(&String, (f64, f64))> =
+                subjects.iter().zip(&sums).map(|(s, r)| (s, r.sums[i][j])).filter(|f| f.1.1 > 0.0).collect();
             if found.is_empty() {
                 continue;
             }
@@ -87,9 +88,8 @@ pub fn validate(model: &Model, variance: f64) -> Result<Validation, ModelError> 
 }
 
 fn leave_out(model: &Model, subject: &str, variance: f64) -> Result<Sums, ModelError> {
-    let cycles = |own: bool| -> Vec<Cycle> {
-        model.members.iter().filter(|m| (m.subject == subject) == own).map(|m| model.cycle_of(m)).collect()
-    };
+    let cycles =
+        |own: bool| -> Vec<Cycle> { model.members.iter().filter(|m| (m.subject == subject) == own).map(|m| model.cycle_of(m)).collect() };
     let others = Model::build(model.activity, model.synthetic, &cycles(false))?;
     let others = others.truncated(others.components(variance));
     let own: Vec<Member> = cycles(true).iter().map(|c| others.member_of(c)).collect();
@@ -153,12 +153,8 @@ fn variability(others: &Model, own: &[Member], own_knots: &[Knot], sums: &mut Su
 /// Mean over the subjects that take part at `parameter`, over all (extended) where nobody does.
 fn population_mean(population: &Population, parameter: f64) -> DVector<f64> {
     let nobody = !population.curves.iter().any(|c| c.takes_part(parameter));
-    let there: Vec<DVector<f64>> = population
-        .curves
-        .iter()
-        .filter(|c| nobody || c.takes_part(parameter))
-        .map(|c| population.extended(c, parameter))
-        .collect();
+    let there: Vec<DVector<f64>> =
+        population.curves.iter().filter(|c| nobody || c.takes_part(parameter)).map(|c| population.extended(c, parameter)).collect();
     let n = there.len() as f64;
     there.into_iter().sum::<DVector<f64>>() / n
 }
