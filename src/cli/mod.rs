@@ -1,5 +1,13 @@
 //! One file per subcommand: load, call the library, save, report.
+mod clouds;
+
 mod disparity;
+mod generate;
+mod model;
+mod motions;
+mod progress;
+mod render;
+mod progress;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -16,14 +24,36 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// The person's point cloud in every frame of a session, as PLY files
+    Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
+    /// Motion databases and their PCA models
+    #[command(subcommand)]
+    Model(model::ModelCommand),
+    /// The same person at other speeds or jump lengths
+    Generate(generate::GenerateArgs),
+    /// Phantom footage of a motion file before a rig, with its truth
+    Render(render::RenderArgs),
 }
 
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
+        Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
+        Command::Render(args) => render::run(&args),
+        Command::Model(command) => model::run(command),
+        Command::Generate(args) => generate::run(args),
     }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0).ok_or("must be a positive number".into())
+}
+
+/// A part of a whole, above 0 and up to 1.
+fn part(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or("must be above 0 and at most 1".into())
 }

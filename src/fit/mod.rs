@@ -11,7 +11,10 @@ pub mod start;
 pub mod state;
 pub mod targets;
 
+use std::sync::Arc;
+
 use nalgebra::{DMatrix, Vector3};
+use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::body::{Length, Pose, Shape};
@@ -19,7 +22,7 @@ use crate::math::arrow::{LmOptions, minimise};
 use crate::motion_model::Model;
 use crate::rig::Rig;
 use curve::Curve;
-use problem::{Fitness, Frame, Free, Problem, Settings, fitness, total};
+use problem::{Fitness, Frame, Free, Known, Outside, Problem, Settings, fitness, total};
 use state::State;
 pub use targets::Observation;
 
@@ -80,6 +83,7 @@ const SETTINGS: Settings = Settings {
     model_m: 0.02,
     point_weight: 0.08,
     ray_weight: 0.08,
+    outside_weight: 0.3,
     acceleration: 1.35,
     angular_acceleration: 5.4,
     phase_acceleration: 1.35,
@@ -87,7 +91,7 @@ const SETTINGS: Settings = Settings {
     stature: 0.03,
     length: 0.025,
     arm_length: 0.05,
-    width: 0.12,
+    width: 0.08,
 };
 
 /// Steadiness of the phase while the start is still rough.
@@ -108,9 +112,7 @@ const SHAPED: Free = Free { lengths: true, ..STYLED };
 /// Everything one run needs beside the state.
 struct Run<'a> {
     model: &'a Model,
-    viewpoint: Vector3<f64>,
-    up: Vector3<f64>,
-    stature_m: f64,
+    known: Known,
     iterations: u64,
 }
 
@@ -121,11 +123,11 @@ impl Run<'_> {
         let mut state = state;
         let mut previous = f64::INFINITY;
         for _ in 0..stage.refreshes {
-            let problem = Problem::new(curve, frames, &settings, stage.free, self.viewpoint, self.up, self.stature_m, &state);
+            let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &state);
             let (next, summary) = minimise(problem, state, &LmOptions { max_iterations: 6, relative_cost: 1e-4 });
             self.iterations += summary.iterations;
             state = next;
-            let cost = total(&fitness(curve, frames, &settings, &self.viewpoint, &state)).cost;
+            let cost = total(&fitness(curve, frames, &settings, &self.known.viewpoint, &state)).cost;
             if (previous - cost).abs() < 1e-3 * cost {
                 break;
             }
@@ -160,12 +162,15 @@ pub fn fit(
     let up = rig.up.direction();
     let viewpoint = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len().max(1) as f64;
     let track = start::track(observations, &viewpoint, &up)?;
-    let sparse: Vec<Frame> = observations.iter().map(|o| targets::frame(o, rig, 200, 40)).collect();
+    let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
+    let chosen =
+        |points, rays| observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, points, rays)).collect();
+    let sparse: Vec<Frame> = chosen(200, 40);
     progress("search for cadence and phase", 0.0);
     let mean = Curve::new(model, 0);
     let search = Settings { model_m: 0.06, ..SETTINGS };
     let found = start::hypotheses(&track, &sparse, &mean, model, &search, &viewpoint);
-    let mut run = Run { model, viewpoint, up, stature_m: track.stature_m, iterations: 0 };
+    let mut run = Run { model, known: Known { viewpoint, up, stature_m: track.stature_m }, iterations: 0 };
     progress("both half-cycles", 0.1);
     let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
     let ten = Curve::new(model, 10);
@@ -180,7 +185,7 @@ pub fn fit(
     let hypotheses = [candidates[0].0, candidates.last().map_or(candidates[0].0, |c| c.0)];
     let mut state = candidates.swap_remove(0).1;
 
-    let dense: Vec<Frame> = observations.iter().map(|o| targets::frame(o, rig, options.points, options.rays)).collect();
+    let dense: Vec<Frame> = chosen(options.points, options.rays);
     progress("all points", 0.4);
     let free_phase = SETTINGS.phase_acceleration;
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, phase_acceleration: free_phase, refreshes: 5 });
@@ -203,18 +208,18 @@ fn pair(found: &[start::Hypothesis]) -> Vec<&start::Hypothesis> {
 }
 
 fn finish(run: Run, state: State, curve: Curve, frames: &[Frame], observations: &[Observation], hypotheses: [f64; 2]) -> Fit {
-    let problem = Problem::new(&curve, frames, &SETTINGS, SHAPED, run.viewpoint, run.up, run.stature_m, &state);
+    let problem = Problem::new(&curve, frames, &SETTINGS, SHAPED, &run.known, &state);
     let size = state.layout().size();
     let (shared_covariance, variances) = problem::uncertainty(&problem, &state).unwrap_or_else(|| {
         (DMatrix::from_element(size, size, f64::NAN), nalgebra::DVector::from_element(state::LOCAL * frames.len(), f64::NAN))
     });
     let frame_sigmas = variances.as_slice().chunks_exact(state::LOCAL).map(|v| std::array::from_fn(|i| v[i].sqrt())).collect();
-    let frames = fitness(&curve, frames, &SETTINGS, &run.viewpoint, &state);
+    let frames = fitness(&curve, frames, &SETTINGS, &run.known.viewpoint, &state);
     let poses = (0..state.carriers.len()).map(|t| state.pose(&curve, t)).collect();
     let seconds = observations.last().map_or(0.0, |o| o.time_s) - observations.first().map_or(0.0, |o| o.time_s);
     let (first, last) = (&state.carriers[0], &state.carriers[state.carriers.len() - 1]);
     let travelled: f64 =
-        state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.up * d.dot(&run.up)).norm()).sum();
+        state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.known.up * d.dot(&run.known.up)).norm()).sum();
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
     Fit { poses, shared_covariance, frame_sigmas, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
 }

@@ -6,8 +6,12 @@
 //! point along the normal; both are refreshed between solver runs, because a step built on frozen weights but judged by
 //! the robust cost is rejected for ever. A silhouette ray counts as the point of the ray nearest to the skin; that point is
 //! frozen too (envelope theorem: its motion along the ray changes the distance in second order only).
+//! A primitive's centre that projects outside a silhouette counts with its distance to it, else nothing would hold back
+//! limbs that reach where no point is.
 //! Stereo sees front sides: a point where the skin faces away from the cameras has weight zero.
 //! Checked against central differences for every kind of unknown.
+
+use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rayon::prelude::*;
@@ -17,7 +21,9 @@ use super::state::{LOCAL, Motion, SharedLayout, State};
 use crate::body::surface::{Evaluation, SKIN};
 use crate::body::{Length, NODES, PosedSurface};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
+use crate::math::distance_field::DistanceField;
 use crate::math::rotation::{hat, left_jacobian, log};
+use crate::rig::Camera;
 
 /// One measurement of the skin.
 #[derive(Clone, Debug)]
@@ -28,11 +34,20 @@ pub enum Target {
     Ray { origin: Vector3<f64>, direction: Vector3<f64>, sigma: f64 },
 }
 
+/// The distance to a silhouette in one camera's picture.
+#[derive(Clone, Debug)]
+pub struct Outside {
+    pub camera: Camera,
+    /// Pixels.
+    pub field: DistanceField,
+}
+
 /// What one frame shows.
 #[derive(Clone, Debug, Default)]
 pub struct Frame {
     pub time_s: f64,
     pub targets: Vec<Target>,
+    pub outsides: Arc<Vec<Outside>>,
 }
 
 /// Standard deviations and weights of equation (1).
@@ -43,6 +58,8 @@ pub struct Settings {
     /// Share of a cloud point that is new information: neighbours share their correlation window.
     pub point_weight: f64,
     pub ray_weight: f64,
+    /// Of a primitive outside a silhouette.
+    pub outside_weight: f64,
     pub acceleration: f64,
     pub angular_acceleration: f64,
     pub phase_acceleration: f64,
@@ -52,6 +69,16 @@ pub struct Settings {
     pub length: f64,
     pub arm_length: f64,
     pub width: f64,
+}
+
+/// What is known before the fit.
+#[derive(Clone, Copy, Debug)]
+pub struct Known {
+    /// Centre of the cameras, metres.
+    pub viewpoint: Vector3<f64>,
+    pub up: Vector3<f64>,
+    /// Expected stature, metres.
+    pub stature_m: f64,
 }
 
 /// Which unknowns may move.
@@ -81,16 +108,24 @@ pub struct Problem<'a> {
     pub frames: &'a [Frame],
     pub settings: &'a Settings,
     pub free: Free,
-    /// Centre of the cameras, metres.
-    pub viewpoint: Vector3<f64>,
-    pub up: Vector3<f64>,
-    /// Expected stature, metres.
-    pub stature_m: f64,
+    pub known: &'a Known,
     frozen: Vec<Vec<Frozen>>,
+    /// Per frame, outside and primitive.
+    frozen_outsides: Vec<Vec<FrozenOutside>>,
+}
+
+/// Frozen quantities of one primitive in one silhouette's picture.
+#[derive(Clone, Copy, Debug, Default)]
+struct FrozenOutside {
+    weight: f64,
+    /// Depth over focal length.
+    metres_per_px: f64,
 }
 
 /// Scale of the Cauchy loss in standard deviations: 95 % efficiency for Gaussian noise.
 const CAUCHY: f64 = 2.385;
+/// The same for silhouettes: a limb far outside is a hole in the mask less often than a limb out of place.
+const OUTSIDE_CAUCHY: f64 = 6.0;
 /// Skin whose outward normal makes a larger cosine than this with the line of sight is not seen.
 const FACING: f64 = 0.2;
 /// Primitives that a ray passes nearest to, tried as the start of its closest approach.
@@ -124,20 +159,41 @@ impl Fitness {
 }
 
 impl<'a> Problem<'a> {
-    #[allow(clippy::too_many_arguments)]
-    pub fn new(
-        curve: &'a Curve,
-        frames: &'a [Frame],
-        settings: &'a Settings,
-        free: Free,
-        viewpoint: Vector3<f64>,
-        up: Vector3<f64>,
-        stature_m: f64,
+    pub fn new(curve: &'a Curve, frames: &'a [Frame], settings: &'a Settings, free: Free, known: &'a Known, state: &State) -> Problem<'a> {
+        let (frozen, frozen_outsides) = (0..frames.len())
+            .into_par_iter()
+            .map(|t| {
+                let surface = state.posed(curve, t).surface;
+                (freeze(&frames[t], &surface, settings, &known.viewpoint).0, freeze_outsides(&frames[t], &surface, settings).0)
+            })
+            .unzip();
+        Problem { curve, frames, settings, free, known, frozen, frozen_outsides }
+    }
+
+    /// Distance of primitive `index` outside a silhouette, metres, and its row.
+    fn outside_row(
+        motion: &Motion,
         state: &State,
-    ) -> Problem<'a> {
-        let frozen =
-            (0..frames.len()).into_par_iter().map(|t| freeze(&frames[t], &state.posed(curve, t).surface, settings, &viewpoint).0).collect();
-        Problem { curve, frames, settings, free, viewpoint, up, stature_m, frozen }
+        frame: usize,
+        index: usize,
+        outside: &Outside,
+        frozen: &FrozenOutside,
+        row: &mut [f64],
+    ) -> f64 {
+        let p = &motion.surface.primitives[index];
+        row.fill(0.0);
+        let Some((pixel, jacobian)) = outside.camera.project_with_jacobian(&p.centre) else { return 0.0 };
+        let (distance, gradient) = outside.field.at(pixel.x, pixel.y);
+        let pull = jacobian.transpose() * nalgebra::Vector2::from(gradient) * frozen.metres_per_px;
+        let layout = state.layout();
+        let moment = p.centre.cross(&pull);
+        let wrench = [pull.x, pull.y, pull.z, moment.x, moment.y, moment.z];
+        for (column, entry) in motion.twists[p.node as usize].column_iter().zip(row.iter_mut()) {
+            *entry += (0..6).map(|i| wrench[i] * column[i]).sum::<f64>();
+        }
+        row[LOCAL + layout.stature()] += pull.dot(&(p.centre - state.carriers[frame].position));
+        row[LOCAL + layout.length(p.limb)] += pull.dot(&p.length_velocity(&Vector3::zeros(), state.shape.lengths[p.limb as usize]));
+        distance * frozen.metres_per_px
     }
 
     /// Residual κ(√d_eff − √d_0) and its row for the unknowns of the frame and the shared ones.
@@ -181,18 +237,25 @@ impl<'a> Problem<'a> {
         let mut normal = FrameNormal { cost: 0.0, hessian: vec![0.0; size * size], gradient: vec![0.0; size] };
         for frozen in self.frozen[frame].iter().filter(|f| f.weight > 0.0) {
             let residual = Self::residual_row(&motion, state, frame, frozen, &mut scratch);
-            normal.cost += 0.5 * frozen.weight * residual * residual;
-            for (i, a) in scratch.row.iter().enumerate() {
-                if *a != 0.0 {
-                    let scaled = a * frozen.weight;
-                    normal.gradient[i] += scaled * residual;
-                    for (entry, b) in normal.hessian[i * size..=i * size + i].iter_mut().zip(&scratch.row) {
-                        *entry += scaled * b;
-                    }
+            normal.add(residual, frozen.weight, &scratch.row);
+        }
+        for (outside, frozen) in self.outsides(frame) {
+            for (index, frozen) in frozen.iter().enumerate() {
+                let residual = Self::outside_row(&motion, state, frame, index, outside, frozen, &mut scratch.row);
+                if residual > 0.0 {
+                    normal.add(residual, frozen.weight, &scratch.row);
                 }
             }
         }
         normal
+    }
+
+    /// The silhouettes of a frame with their frozen quantities, one per primitive.
+    fn outsides(&self, frame: usize) -> impl Iterator<Item = (&Outside, &[FrozenOutside])> {
+        let outsides = &self.frames[frame].outsides;
+        let frozen = &self.frozen_outsides[frame];
+        let each = frozen.len() / outsides.len().max(1);
+        outsides.iter().zip(frozen.chunks(each.max(1)))
     }
 
     fn frame_cost(&self, state: &State, frame: usize) -> f64 {
@@ -203,7 +266,16 @@ impl<'a> Problem<'a> {
             let r = f.metres_per_root * (evaluation.root() - SKIN.sqrt());
             0.5 * f.weight * r * r
         });
-        squares.sum()
+        let points: f64 = squares.sum();
+        let outside = self.outsides(frame).flat_map(|(outside, frozen)| {
+            posed
+                .surface
+                .primitives
+                .iter()
+                .zip(frozen)
+                .map(|(p, f)| 0.5 * f.weight * (outside_px(outside, &p.centre) * f.metres_per_px).powi(2))
+        });
+        points + outside.sum::<f64>()
     }
 
     /// Residuals of the shared priors: index into z, value, derivative.
@@ -217,7 +289,7 @@ impl<'a> Problem<'a> {
             .enumerate()
             .map(|(i, (a, lambda))| (i, a / lambda.sqrt(), 1.0 / lambda.sqrt()))
             .collect();
-        priors.push((layout.stature(), (state.shape.stature_m / self.stature_m).ln() / s.stature, 1.0 / s.stature));
+        priors.push((layout.stature(), (state.shape.stature_m / self.known.stature_m).ln() / s.stature, 1.0 / s.stature));
         for i in 0..Length::COUNT {
             let arm = [Length::Shoulders, Length::UpperArm, Length::Forearm, Length::Hand].iter().any(|l| *l as usize == i);
             let sigma = if arm { s.arm_length } else { s.length };
@@ -233,8 +305,8 @@ impl<'a> Problem<'a> {
         let c = &state.carriers;
         let tilt = self.settings.tilt * (c.len() as f64).sqrt();
         for (t, carrier) in c.iter().enumerate() {
-            let up_in_carrier = carrier.world_from_carrier.inverse() * self.up;
-            let slope = carrier.world_from_carrier.inverse().to_rotation_matrix().into_inner() * hat(&self.up);
+            let up_in_carrier = carrier.world_from_carrier.inverse() * self.known.up;
+            let slope = carrier.world_from_carrier.inverse().to_rotation_matrix().into_inner() * hat(&self.known.up);
             for axis in [0, 2] {
                 let row = (0..3).map(|k| (LOCAL * t + k, slope[(axis, k)] / tilt)).collect();
                 priors.push((up_in_carrier[axis] / tilt, row));
@@ -319,6 +391,20 @@ struct FrameNormal {
 }
 
 impl FrameNormal {
+    fn add(&mut self, residual: f64, weight: f64, row: &[f64]) {
+        let size = row.len();
+        self.cost += 0.5 * weight * residual * residual;
+        for (i, a) in row.iter().enumerate() {
+            if *a != 0.0 {
+                let scaled = a * weight;
+                self.gradient[i] += scaled * residual;
+                for (entry, b) in self.hessian[i * size..=i * size + i].iter_mut().zip(row) {
+                    *entry += scaled * b;
+                }
+            }
+        }
+    }
+
     fn scatter(&self, frame: usize, normal: &mut NormalEquations) {
         let size = self.gradient.len();
         normal.cost += self.cost;
@@ -427,9 +513,31 @@ fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings, viewpoint:
     (frozen.collect(), fitness)
 }
 
+fn outside_px(outside: &Outside, x: &Vector3<f64>) -> f64 {
+    outside.camera.project(x).map_or(0.0, |pixel| outside.field.at(pixel.x, pixel.y).0)
+}
+
+/// Frozen quantities of the primitives in a frame's silhouettes, and their robust cost.
+fn freeze_outsides(frame: &Frame, surface: &PosedSurface, settings: &Settings) -> (Vec<FrozenOutside>, f64) {
+    let mut cost = 0.0;
+    let precision = 1.0 / (settings.model_m * settings.model_m);
+    let frozen = frame.outsides.iter().flat_map(|o| surface.primitives.iter().map(move |p| (o, p))).map(|(outside, p)| {
+        let metres_per_px = outside.camera.camera_point(&p.centre).z / outside.camera.matrix[(0, 0)];
+        let scaled = (outside_px(outside, &p.centre) * metres_per_px).powi(2) * precision / (OUTSIDE_CAUCHY * OUTSIDE_CAUCHY);
+        cost += settings.outside_weight * 0.5 * OUTSIDE_CAUCHY * OUTSIDE_CAUCHY * scaled.ln_1p();
+        FrozenOutside { weight: settings.outside_weight * precision / (1.0 + scaled), metres_per_px }
+    });
+    (frozen.collect(), cost)
+}
+
 /// Robust fitness of each frame at a state.
 pub fn fitness(curve: &Curve, frames: &[Frame], settings: &Settings, viewpoint: &Vector3<f64>, state: &State) -> Vec<Fitness> {
-    (0..frames.len()).into_par_iter().map(|t| freeze(&frames[t], &state.posed(curve, t).surface, settings, viewpoint).1).collect()
+    let of_frame = |t: usize| {
+        let surface = state.posed(curve, t).surface;
+        let points = freeze(&frames[t], &surface, settings, viewpoint).1;
+        Fitness { cost: points.cost + freeze_outsides(&frames[t], &surface, settings).1, ..points }
+    };
+    (0..frames.len()).into_par_iter().map(of_frame).collect()
 }
 
 /// Sum over frames, in their order.
@@ -492,6 +600,7 @@ mod tests {
         model_m: 0.03,
         point_weight: 0.1,
         ray_weight: 0.1,
+        outside_weight: 0.3,
         acceleration: 1.0,
         angular_acceleration: 4.0,
         phase_acceleration: 1.0,
@@ -501,6 +610,7 @@ mod tests {
         arm_length: 0.06,
         width: 0.1,
     };
+    const KNOWN: Known = Known { viewpoint: Vector3::new(0.1, 0.0, 1.0), up: Vector3::new(0.0, 0.0, 1.0), stature_m: 1.75 };
     const ALL: Free = Free { rotation: true, phase: true, weights: true, stature: true, lengths: true, widths: true };
 
     fn state() -> State {
@@ -530,7 +640,17 @@ mod tests {
                         Target::Point { x, covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 4e-4, 1e-4)) }
                     }
                 });
-                Frame { time_s: [0.0, 0.033, 0.1][t], targets: targets.collect() }
+                // A silhouette that half of the body is outside of, seen by a distorted camera at the world's origin.
+                let camera = Camera {
+                    name: "test".into(),
+                    size_px: [640, 480],
+                    matrix: Matrix3::new(550.0, 0.0, 320.0, 0.0, 545.0, 240.0, 0.0, 0.0, 1.0),
+                    distortion: [-0.08, 0.01, 1e-3, -5e-4, 0.0],
+                    camera_from_world: nalgebra::Rotation3::new(Vector3::new(1.62, -0.01, 0.02)),
+                    translation: Vector3::new(0.02, 0.95, 0.05),
+                };
+                let field = DistanceField::new(640, 480, 2, |x, y| x * 3 + y < 1200);
+                Frame { time_s: [0.0, 0.033, 0.1][t], targets: targets.collect(), outsides: Arc::new(vec![Outside { camera, field }]) }
             })
             .collect()
     }
@@ -541,9 +661,10 @@ mod tests {
         let curve = Curve::new(&model, 3);
         let state = state();
         let frames = frames(&curve, &state);
-        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, Vector3::new(0.1, 0.0, 1.0), Vector3::z(), 1.75, &state);
+        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
         let normal = problem.linearise(&state);
         assert!((normal.cost - problem.cost(&state)).abs() < 1e-9 * normal.cost);
+        assert!(freeze_outsides(&frames[1], &state.posed(&curve, 1).surface, &SETTINGS).1 > 1.0, "the silhouette must matter");
         let (locals, shareds) = (normal.local_gradient.len(), normal.shared_gradient.len());
         for i in 0..locals + shareds {
             let at = |h: f64| {
@@ -566,7 +687,7 @@ mod tests {
         let curve = Curve::new(&model, 3);
         let state = state();
         let frames = frames(&curve, &state);
-        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, Vector3::new(0.1, 0.0, 1.0), Vector3::z(), 1.75, &state);
+        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
         let size = LOCAL + state.layout().size();
         let mut scratch = Scratch::new(size);
         let motion = state.motion(&curve, 1);
@@ -615,7 +736,7 @@ mod tests {
         let state = state();
         let frames = frames(&curve, &state);
         let free = Free { weights: true, ..Free::default() };
-        let problem = Problem::new(&curve, &frames, &SETTINGS, free, Vector3::zeros(), Vector3::z(), 1.75, &state);
+        let problem = Problem::new(&curve, &frames, &SETTINGS, free, &KNOWN, &state);
         let (y, z) = problem.linearise(&state).step(0.1).unwrap();
         assert!(y.iter().enumerate().all(|(i, v)| (3..6).contains(&(i % LOCAL)) || *v == 0.0));
         assert!(z.rows(0, 3).amax() > 0.0 && z.rows(3, z.len() - 3).amax() == 0.0);

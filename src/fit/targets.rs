@@ -1,12 +1,14 @@
 //! Measurements of one frame: thinned cloud points and silhouette rays.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use image::GrayImage;
 use nalgebra::{Matrix3, Point2, Vector3};
 
-use super::problem::{Frame, Target};
+use super::problem::{Frame, Outside, Target};
 use crate::clouds::Cloud;
+use crate::math::distance_field::DistanceField;
 use crate::rig::{Camera, Rig};
 
 /// What the cameras saw of the person at one instant.
@@ -24,18 +26,33 @@ pub struct Observation {
 const VOXEL_M: f64 = 0.025;
 /// Uncertainty of a mask's outline.
 const OUTLINE_PX: f64 = 1.5;
+/// Cells of the distance to a silhouette: half the memory of pixels in each direction, a centimetre at 3 m.
+const FIELD_STEP_PX: usize = 2;
 /// Outlines this close to the image border are the border's.
 const BORDER_PX: u32 = 3;
 
+/// Distances to the silhouettes of one frame.
+pub fn outsides(observation: &Observation, rig: &Rig) -> Vec<Outside> {
+    let masks = rig.cameras.iter().zip(&observation.masks);
+    let known = masks.filter_map(|(camera, mask)| mask.as_ref().map(|m| (camera, m)));
+    known
+        .map(|(camera, mask)| {
+            let (width, height) = (mask.width() as usize, mask.height() as usize);
+            let inside = |x: usize, y: usize| mask.as_raw()[y * width + x] > 127;
+            Outside { camera: camera.clone(), field: DistanceField::new(width, height, FIELD_STEP_PX, inside) }
+        })
+        .collect()
+}
+
 /// At most `points` cloud points and `rays` silhouette rays per camera, evenly chosen.
-pub fn frame(observation: &Observation, rig: &Rig, points: usize, rays: usize) -> Frame {
+pub fn frame(observation: &Observation, rig: &Rig, outsides: &Arc<Vec<Outside>>, points: usize, rays: usize) -> Frame {
     let mut targets = evenly(&thinned(&observation.cloud), points);
     for (camera, mask) in rig.cameras.iter().zip(&observation.masks) {
         if let Some(mask) = mask {
             targets.extend(evenly(&outline(mask), rays).iter().filter_map(|pixel| ray(camera, pixel)));
         }
     }
-    Frame { time_s: observation.time_s, targets }
+    Frame { time_s: observation.time_s, targets, outsides: outsides.clone() }
 }
 
 fn evenly<T: Clone>(items: &[T], wanted: usize) -> Vec<T> {

@@ -254,4 +254,16 @@ up = "y"
         assert!(lab.baselines_m().iter().zip(expected_m).all(|(b, expected)| (b.2 - expected).abs() < 1e-4));
         assert_eq!(lab.validate_stereo(), Ok(()));
     }
+
+    #[test]
+    fn the_phantoms_rig_sees_a_whole_person() {
+        let rig = read_rig(&Path::new(env!("CARGO_MANIFEST_DIR")).join("calib/phantom_lab.toml")).unwrap();
+        assert!(rig.baselines_m()[..2].iter().all(|b| (b.2 - 0.30).abs() < 0.005));
+        assert_eq!((rig.cameras.len(), rig.validate_stereo(), rig.up), (3, Ok(()), Up::Z));
+        assert!((rig.cameras[0].centre() - Vector3::new(0.0, 0.0, 1.0)).norm() < 1e-5);
+        for (camera, y, z) in rig.cameras.iter().flat_map(|c| [(c, 3.0, 0.0), (c, 3.0, 1.9), (c, 4.5, 0.0), (c, 4.5, 1.9)]) {
+            let pixel = camera.project(&Vector3::new(0.0, y, z)).unwrap();
+            assert!((0.0..639.0).contains(&pixel.x) && (0.0..479.0).contains(&pixel.y), "{} at {y} m: {pixel}", camera.name);
+        }
+    }
 }

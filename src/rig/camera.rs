@@ -7,7 +7,7 @@
 //! The inverse is a Newton iteration; it fails beyond the radius where (1) folds over.
 //! Checked against cv::projectPoints and cv::undistortPoints.
 
-use nalgebra::{Matrix2, Matrix3, Point2, Rotation3, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Point2, Rotation3, Vector2, Vector3};
 
 /// One calibrated camera.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +39,19 @@ impl Camera {
     pub fn project(&self, x_in_world: &Vector3<f64>) -> Option<Point2<f64>> {
         let p = self.camera_point(x_in_world);
         (p.z > 1e-3).then(|| self.distorted_pixel(&Vector2::new(p.x / p.z, p.y / p.z)))
+    }
+
+    /// Pixel of a world point and its derivative for the point, pixels per metre; `None` behind the camera.
+    pub fn project_with_jacobian(&self, x_in_world: &Vector3<f64>) -> Option<(Point2<f64>, Matrix2x3<f64>)> {
+        let p = self.camera_point(x_in_world);
+        if p.z <= 1e-3 {
+            return None;
+        }
+        let normalised = Vector2::new(p.x / p.z, p.y / p.z);
+        let perspective = Matrix2x3::new(1.0, 0.0, -normalised.x, 0.0, 1.0, -normalised.y) / p.z;
+        let lens = self.distort(&normalised).1;
+        let pixels = self.matrix.fixed_view::<2, 2>(0, 0);
+        Some((self.distorted_pixel(&normalised), pixels * lens * perspective * self.camera_from_world.matrix()))
     }
 
     /// Pixel of the normalised image point (X/Z, Y/Z).
