@@ -7,7 +7,6 @@ mod model;
 mod motions;
 mod progress;
 mod render;
-mod progress;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
