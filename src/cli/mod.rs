@@ -9,7 +9,6 @@ mod observe;
 mod progress;
 mod render;
 mod track;
-mod progress;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
