@@ -1,5 +1,15 @@
 //! Simultaneous images with times, synchronization check, foreground.
 
+pub mod check;
+
+pub mod epipolar;
+
+pub mod foreground;
+
+pub mod regions;
+
+pub use foreground::{ForegroundOptions, foreground, spread, stage_from_frames};
+
 use image::GrayImage;
 
 /// What all cameras saw at one time.
