@@ -249,8 +249,11 @@ fn label(
 ) -> Label {
     let changed = changes[k].changed.as_raw()[i] != 0;
     let shaded = changes[k].shaded.as_raw()[i] != 0;
-    let spread = if changed { ratio_spread(rectification, k, i, changes, stage_px) } else { 0.0 };
-    let shaded = changes[k].ratio[i] < 0.0 && (spread < SAME_RATIO || (shaded && spread < OTHER_RATIO));
+    let spread = if changed { ratio_spread(rectification, k, i, changes, stage_px) } else { None };
+    let shaded = match spread {
+        Some(spread) => changes[k].ratio[i] < 0.0 && (spread < SAME_RATIO || (shaded && spread < OTHER_RATIO)),
+        None => shaded,
+    };
     if disparity.is_nan() {
         return match (changed, shaded) {
             (true, false) => Label::Undecided,
@@ -277,31 +280,27 @@ const SAME_RATIO: f32 = 0.03;
 /// Farther apart than this (logarithm) even a smooth darkening is no shadow; smaller lets half hidden shadows pass for a person.
 const OTHER_RATIO: f32 = 0.1;
 
-/// Largest difference of the ratio between view `k` and where the others see the same place of the stage.
-fn ratio_spread(rectification: &Rectification, k: usize, i: usize, changes: &[Change], stage_px: f32) -> f32 {
-    let width = changes[k].changed.width();
-    let height = changes[k].changed.height();
-    (0..changes.len()).filter(|&j| j != k).fold(0.0, |worst: f32, j| {
-        let step = rectification.views[j].step - rectification.views[k].step;
-        let x = ((i as u32 % width) as f64 + step.x * f64::from(stage_px)).round();
-        let y = ((i as u32 / width) as f64 + step.y * f64::from(stage_px)).round();
-        if x >= 0.0 && y >= 0.0 && x < f64::from(width) && y < f64::from(height) {
-            worst.max((changes[j].ratio[y as usize * width as usize + x as usize] - changes[k].ratio[i]).abs())
-        } else {
-            worst
-        }
-    })
+/// Largest difference of the ratio between view `k` and where the others see the same place of the stage; `None` where no
+/// other view sees it.
+fn ratio_spread(rectification: &Rectification, k: usize, i: usize, changes: &[Change], stage_px: f32) -> Option<f32> {
+    let others = (0..changes.len()).filter(|&j| j != k);
+    let there = others.filter_map(|j| Some(changes[j].ratio[pixel_in(rectification, k, j, i, stage_px)?]));
+    there.map(|ratio| (ratio - changes[k].ratio[i]).abs()).reduce(f32::max)
 }
 
 /// Whether view `j` shows a change where it sees pixel `i` of view `k` at this disparity.
 fn changed_at(rectification: &Rectification, k: usize, j: usize, i: usize, changes: &[Change], disparity: f32) -> bool {
-    let changed = &changes[j].changed;
-    let (width, height) = changed.dimensions();
+    pixel_in(rectification, k, j, i, disparity).is_some_and(|there| changes[j].changed.as_raw()[there] != 0)
+}
+
+/// The pixel of view `j` that shows pixel `i` of view `k` at this disparity.
+fn pixel_in(rectification: &Rectification, k: usize, j: usize, i: usize, disparity: f32) -> Option<usize> {
+    let [width, height] = rectification.size_px.map(|s| s as usize);
     let step = rectification.views[j].step - rectification.views[k].step;
-    let x = (i as u32 % width) as f64 + step.x * f64::from(disparity);
-    let y = (i as u32 / width) as f64 + step.y * f64::from(disparity);
-    let (x, y) = (x.round(), y.round());
-    x >= 0.0 && y >= 0.0 && x < f64::from(width) && y < f64::from(height) && changed.get_pixel(x as u32, y as u32).0[0] != 0
+    let x = ((i % width) as f64 + step.x * f64::from(disparity)).round();
+    let y = ((i / width) as f64 + step.y * f64::from(disparity)).round();
+    let inside = x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
+    inside.then(|| y as usize * width + x as usize)
 }
 
 /// Drops outline pixels that changed less than half as much as their surroundings: they are mostly stage.
