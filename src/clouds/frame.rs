@@ -312,6 +312,20 @@ mod tests {
     }
 
     #[test]
+    fn two_cameras_are_enough() {
+        let Some(folder) = footage("p12_walk_lab") else { return };
+        let options = CloudOptions::default();
+        let (mut rig, _) = ready(&folder, &options);
+        rig.cameras.truncate(2);
+        let stage: Vec<GrayImage> = (0..2).map(|k| grey(folder.join(format!("cam_0{k}_background.png")))).collect();
+        let pair = CloudRig::new(&rig, Some(&stage), &options).unwrap();
+        let frame = pair.frame(&pictures(&folder, 20)[..2], &options).unwrap();
+        let [error, off, density, iou] = score(&rig, &frame, &folder, 20);
+        println!("two cameras: {:.1} mm, {:.2} % off the body, density {density:.3}, IoU {iou:.3}", 1e3 * error, 100.0 * off);
+        assert!(error < 0.01 && off < 0.05 && density > 0.8 && iou > 0.8, "{error} {off} {density} {iou}");
+    }
+
+    #[test]
     fn an_empty_stage_gives_an_empty_cloud() {
         let Some(folder) = footage("p39_walk_digiclops") else { return };
         let options = CloudOptions::default();

@@ -39,7 +39,7 @@ pub fn keep_large(mask: &mut GrayImage, area_px: usize) {
 /// Fills unset pieces smaller than `area_px` pixels that do not touch the border.
 pub fn fill_holes(mask: &mut GrayImage, area_px: usize) {
     let (width, height) = (mask.width() as usize, mask.height() as usize);
-    let on_border = |i: &usize| i % width == 0 || i % width == width - 1 || i / width == 0 || i / width == height - 1;
+    let on_border = |i: &usize| i.is_multiple_of(width) || i % width == width - 1 || i / width == 0 || i / width == height - 1;
     for piece in pieces(mask, |v| v == 0).into_iter().filter(|p| p.len() < area_px && !p.iter().any(on_border)) {
         paint(mask, &piece, 255);
     }

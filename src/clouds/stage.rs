@@ -2,7 +2,7 @@
 //!
 //! A pixel belongs to the person when (a) its grey value changed against the empty stage and (b) the present pictures do not
 //! match at the stage's own disparity. A cast shadow changes the grey value but stays at the stage's depth in all views, so
-//! (b) removes it; a blurred match beside the outline has the person's depth but unchanged grey values, so (a) removes it.
+//! (b) removes it, together with its two own marks: it darkens smoothly, and by the same ratio in all views; a blurred match beside the outline has the person's depth but unchanged grey values, so (a) removes it.
 //! Changed pixels without a valid match (occluded in the other views) go with their neighbours.
 //!
 //! Fails where the person stays within [`StageOptions::clearance_m`] of the stage, and for mirrors and curtains.
@@ -115,6 +115,8 @@ fn fill_line(values: &mut [f32], line: Vec<usize>) {
 pub(crate) struct Change {
     /// Smoothed difference, grey levels.
     pub difference: Vec<f32>,
+    /// Smoothed logarithm of the ratio.
+    pub ratio: Vec<f32>,
     /// 255 where the difference exceeds its noise.
     pub changed: GrayImage,
     /// 255 where the grey values are a smooth fraction of the stage's, as in a cast shadow.
@@ -145,7 +147,7 @@ pub(crate) fn compare(now: &Plane, stage: &Plane, options: &StageOptions) -> Cha
     let changed = mask(&|i| difference[i].abs() > options.change_sigmas * noise);
     let mut shaded = mask(&|i| roughness[i] < smooth && coarse[i] < 0.0 && coarse[i] > DARKEST_SHADE);
     grow_shade(&mut shaded, &ratio, step);
-    Change { difference, changed, shaded }
+    Change { difference, ratio, changed, shaded }
 }
 
 /// Roughness reaches a few pixels beyond an outline; there the shadow grows over small steps of the ratio.
@@ -247,6 +249,11 @@ fn label(
 ) -> Label {
     let changed = changes[k].changed.as_raw()[i] != 0;
     let shaded = changes[k].shaded.as_raw()[i] != 0;
+    let spread = if changed { ratio_spread(rectification, k, i, changes, stage_px) } else { None };
+    let shaded = match spread {
+        Some(spread) => changes[k].ratio[i] < 0.0 && (spread < SAME_RATIO || (shaded && spread < OTHER_RATIO)),
+        None => shaded,
+    };
     if disparity.is_nan() {
         return match (changed, shaded) {
             (true, false) => Label::Undecided,
@@ -266,15 +273,34 @@ fn label(
     if 2 * votes > changes.len() || (changed && changes.len() == 2) { Label::Person } else { Label::Nothing }
 }
 
+/// A shadow darkens a place of the stage by the same ratio in all views: closer than this (logarithm) no more evidence is
+/// needed. Three times the noise of 8-bit pictures of medium brightness; larger takes parts of the person for shadow.
+const SAME_RATIO: f32 = 0.03;
+
+/// Farther apart than this (logarithm) even a smooth darkening is no shadow; smaller lets half hidden shadows pass for a person.
+const OTHER_RATIO: f32 = 0.1;
+
+/// Largest difference of the ratio between view `k` and where the others see the same place of the stage; `None` where no
+/// other view sees it.
+fn ratio_spread(rectification: &Rectification, k: usize, i: usize, changes: &[Change], stage_px: f32) -> Option<f32> {
+    let others = (0..changes.len()).filter(|&j| j != k);
+    let there = others.filter_map(|j| Some(changes[j].ratio[pixel_in(rectification, k, j, i, stage_px)?]));
+    there.map(|ratio| (ratio - changes[k].ratio[i]).abs()).reduce(f32::max)
+}
+
 /// Whether view `j` shows a change where it sees pixel `i` of view `k` at this disparity.
 fn changed_at(rectification: &Rectification, k: usize, j: usize, i: usize, changes: &[Change], disparity: f32) -> bool {
-    let changed = &changes[j].changed;
-    let (width, height) = changed.dimensions();
+    pixel_in(rectification, k, j, i, disparity).is_some_and(|there| changes[j].changed.as_raw()[there] != 0)
+}
+
+/// The pixel of view `j` that shows pixel `i` of view `k` at this disparity.
+fn pixel_in(rectification: &Rectification, k: usize, j: usize, i: usize, disparity: f32) -> Option<usize> {
+    let [width, height] = rectification.size_px.map(|s| s as usize);
     let step = rectification.views[j].step - rectification.views[k].step;
-    let x = (i as u32 % width) as f64 + step.x * f64::from(disparity);
-    let y = (i as u32 / width) as f64 + step.y * f64::from(disparity);
-    let (x, y) = (x.round(), y.round());
-    x >= 0.0 && y >= 0.0 && x < f64::from(width) && y < f64::from(height) && changed.get_pixel(x as u32, y as u32).0[0] != 0
+    let x = ((i % width) as f64 + step.x * f64::from(disparity)).round();
+    let y = ((i / width) as f64 + step.y * f64::from(disparity)).round();
+    let inside = x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
+    inside.then(|| y as usize * width + x as usize)
 }
 
 /// Drops outline pixels that changed less than half as much as their surroundings: they are mostly stage.
