@@ -6,6 +6,7 @@
 use nalgebra::{UnitQuaternion, Vector3};
 
 use super::skeleton::{BALL_JOINTS, Joint, NODES};
+use crate::math::rotation::{exp, log};
 
 /// Root placement and joint rotations of one instant.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,6 +22,16 @@ impl Pose {
     /// Standing at rest with the root at `root`.
     pub fn rest(root: Vector3<f64>) -> Pose {
         Pose { root, world_from_root: UnitQuaternion::identity(), joints: [UnitQuaternion::identity(); BALL_JOINTS] }
+    }
+
+    /// The pose at `part` of the way to `other`: slerp for rotations, linear for the root.
+    pub fn towards(&self, other: &Pose, part: f64) -> Pose {
+        let turn = |a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>| a * exp(&(log(&(a.inverse() * b)) * part));
+        Pose {
+            root: self.root.lerp(&other.root, part),
+            world_from_root: turn(&self.world_from_root, &other.world_from_root),
+            joints: std::array::from_fn(|k| turn(&self.joints[k], &other.joints[k])),
+        }
     }
 
     /// Rotation of a ball joint. Panics for the root, whose rotation is `world_from_root`.
@@ -60,7 +71,6 @@ pub fn place(offsets: &[Vector3<f64>; NODES], pose: &Pose) -> Placement {
 mod tests {
     use super::*;
     use crate::body::Shape;
-    use crate::math::rotation::exp;
 
     #[test]
     fn knee_and_hip_flexion_move_the_ankle_as_by_hand() {

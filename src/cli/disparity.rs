@@ -60,7 +60,7 @@ pub fn run(args: &DisparityArgs) -> Result<()> {
     }
     let views: Vec<PreparedView> = views.iter().map(|(_, image, step)| PreparedView::new(plane(image), *step)).collect();
     let all = Region { x: [0, size.0 as usize], y: [0, size.1 as usize] };
-    let found = match_views(&views, &vec![all; views.len()], [0, args.max_disparity.into()], &StereoOptions::default(), &[]);
+    let found = match_views(&views, &vec![all; views.len()], [0, args.max_disparity.into()], &StereoOptions::default());
     Ok(write_pfm(&args.output, &found[0].disparity)?)
 }
 

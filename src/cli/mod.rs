@@ -1,8 +1,15 @@
 //! One file per subcommand: load, call the library, save, report.
+mod clouds;
 
 mod check;
 mod disparity;
+mod generate;
+mod model;
+mod motions;
+mod observe;
 mod progress;
+mod render;
+mod track;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
@@ -21,8 +28,19 @@ pub struct Cli {
 enum Command {
     /// What is wrong with a session and what to do, before any long work
     Check(check::CheckArgs),
+    /// The person's point cloud in every frame of a session, as PLY files
+    Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
+    /// Motion databases and their PCA models
+    #[command(subcommand)]
+    Model(model::ModelCommand),
+    /// The same person at other speeds or jump lengths
+    Generate(generate::GenerateArgs),
+    /// A session's footage to the person's motion, style and size
+    Track(track::TrackArgs),
+    /// Phantom footage of a motion file before a rig, with its truth
+    Render(render::RenderArgs),
 }
 
 /// OpenCV and FFmpeg print about damaged files on stderr, where our own one sentence belongs; their own variables decide.
@@ -40,6 +58,20 @@ pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
         Command::Check(args) => check::run(&args),
+        Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
+        Command::Track(args) => track::run(&args),
+        Command::Render(args) => render::run(&args),
+        Command::Model(command) => model::run(command),
+        Command::Generate(args) => generate::run(args),
     }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| v.is_finite() && *v > 0.0).ok_or("must be a positive number".into())
+}
+
+/// A part of a whole, above 0 and up to 1.
+fn part(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| *v > 0.0 && *v <= 1.0).ok_or("must be above 0 and at most 1".into())
 }

@@ -63,35 +63,25 @@ pub struct Matches {
     pub cost: Vec<[u16; 3]>,
     /// The lowest C more than one disparity away from the best.
     pub rival: Vec<u16>,
-    /// The lowest C within one pixel of the probed disparity; `u16::MAX` where nothing was probed.
-    pub probed: Vec<u16>,
 }
 
 /// Finds the best disparity of every pixel of `region`. `others` are the other views' pictures with their steps against the
-/// reference's; `probe` may name one disparity per pixel of the region whose cost is wanted too (NaN: none).
-pub fn correlate(
-    reference: &GrayImage,
-    others: &[(&GrayImage, Vector2<f64>)],
-    region: Region,
-    search: &Search,
-    probe: Option<&[f32]>,
-) -> Matches {
+/// reference's.
+pub fn correlate(reference: &GrayImage, others: &[(&GrayImage, Vector2<f64>)], region: Region, search: &Search) -> Matches {
     let starts: Vec<usize> = (region.y[0]..region.y[1]).step_by(BAND_ROWS).collect();
     let bands: Vec<Matches> = starts
         .into_par_iter()
         .map(|y| {
             let band = Region { x: region.x, y: [y, (y + BAND_ROWS).min(region.y[1])] };
             let volume = band_volume(reference, others, band, search);
-            let rows = (y - region.y[0]) * region.width()..;
-            winners(&volume, band, search, others.len(), probe.map(|p| &p[rows.start..]))
+            winners(&volume, band, search, others.len())
         })
         .collect();
-    let mut all = Matches { region, best: Vec::new(), cost: Vec::new(), rival: Vec::new(), probed: Vec::new() };
+    let mut all = Matches { region, best: Vec::new(), cost: Vec::new(), rival: Vec::new() };
     for band in bands {
         all.best.extend(band.best);
         all.cost.extend(band.cost);
         all.rival.extend(band.rival);
-        all.probed.extend(band.probed);
     }
     all
 }
@@ -147,6 +137,8 @@ fn truncated_differences(
 
 /// Pixels `x0..` of row `y` of the picture moved back by `shift`; 0 outside. Fractional shifts are interpolated.
 fn shifted_row(image: &GrayImage, shift: Vector2<f64>, x0: isize, y: isize, out: &mut [u8]) {
+    // Steps come from an inverted matrix: 1 + 2e-16 must not cost an interpolation.
+    let shift = shift.map(|s| if (s - s.round()).abs() < 1e-6 { s.round() } else { s });
     let (whole, part) = (shift.map(f64::floor), shift - shift.map(f64::floor));
     let (x0, y) = (x0 + whole.x as isize, y + whole.y as isize);
     if part.norm() < 1e-6 {
@@ -218,17 +210,11 @@ fn lean_windows(centre: &[u16], corners: [&[u16]; 4], out: &mut [u16]) {
     }
 }
 
-fn winners(volume: &[u16], band: Region, search: &Search, pairs: usize, probe: Option<&[f32]>) -> Matches {
+fn winners(volume: &[u16], band: Region, search: &Search, pairs: usize) -> Matches {
     let width = band.width();
     let disparities = search.last + 1 - search.first;
     let count = width * band.height();
-    let mut found = Matches {
-        region: band,
-        best: vec![0; count],
-        cost: vec![[0; 3]; count],
-        rival: vec![u16::MAX; count],
-        probed: vec![u16::MAX; count],
-    };
+    let mut found = Matches { region: band, best: vec![0; count], cost: vec![[0; 3]; count], rival: vec![u16::MAX; count] };
     let mut lowest = vec![u16::MAX; width];
     for y in 0..band.height() {
         let at = |d: usize| &volume[(y * disparities + d) * width..][..width];
@@ -251,12 +237,87 @@ fn winners(volume: &[u16], band: Region, search: &Search, pairs: usize, probe: O
             let b = best[x] as usize;
             let cost = |d: Option<usize>| d.filter(|&d| d < disparities).map_or(u16::MAX, |d| at(d)[x]);
             found.cost[y * width + x] = [cost(b.checked_sub(1)), cost(Some(b)), cost(Some(b + 1))];
-            if let Some(p) = probe.map(|p| p[y * width + x]).filter(|p| !p.is_nan()) {
-                let near = (p - search.first as f32).round().max(0.0) as usize;
-                found.probed[y * width + x] = (near.saturating_sub(1)..=near + 1).map(|d| cost(Some(d))).min().unwrap_or(u16::MAX);
-            }
             best[x] = if usize::from(lowest[x]) >= none { NO_MATCH } else { (b + search.first) as u16 };
         }
     }
     found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Luma;
+    use rand::RngExt;
+    use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+
+    fn noise(seed: u64) -> GrayImage {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        GrayImage::from_fn(70, 50, |_, _| Luma([random.random_range(1..=255)]))
+    }
+
+    /// Equations (1) to (3) as they are written.
+    fn by_definition(reference: &GrayImage, others: &[(&GrayImage, Vector2<f64>)], at: [i64; 2], d: i64, search: &Search) -> u16 {
+        let read = |image: &GrayImage, x: i64, y: i64| {
+            if x < 0 || y < 0 || x >= 70 || y >= 50 { 0 } else { image.get_pixel(x as u32, y as u32).0[0] }
+        };
+        let r = search.radius as i64;
+        let pair = |centre: [i64; 2], k: usize| {
+            let (other, step) = others[k];
+            let mut sum = 0;
+            for y in centre[1] - r..=centre[1] + r {
+                for x in centre[0] - r..=centre[0] + r {
+                    let (a, b) = (read(reference, x, y), read(other, x + step.x as i64 * d, y + step.y as i64 * d));
+                    sum += u16::from(if a == 0 || b == 0 { search.truncation } else { a.abs_diff(b).min(search.truncation) });
+                }
+            }
+            sum
+        };
+        let together = |centre: [i64; 2]| {
+            let costs: Vec<u16> = (0..others.len()).map(|k| pair(centre, k)).collect();
+            let penalty = search.occlusion_penalty * ((2 * r + 1) * (2 * r + 1)) as u16;
+            if costs.len() == 2 { costs.iter().sum::<u16>().min(2 * (costs.iter().min().unwrap() + penalty)) } else { costs.iter().sum() }
+        };
+        let mut corners: Vec<u16> =
+            [(-1, -1), (1, -1), (-1, 1), (1, 1)].map(|(i, j)| together([at[0] + 2 * r * i, at[1] + 2 * r * j])).into();
+        corners.sort_unstable();
+        together(at) + corners[0] + corners[1]
+    }
+
+    #[test]
+    fn running_sums_meet_the_definition() {
+        let (a, b, c) = (noise(1), noise(2), noise(3));
+        let steps = [Vector2::new(-1.0, 0.0), Vector2::new(0.0, 1.0)];
+        let search = Search { first: 2, last: 9, radius: 2, truncation: 50, occlusion_penalty: 3 };
+        let region = Region { x: [0, 70], y: [0, 50] };
+        for others in [&[(&b, steps[0])][..], &[(&b, steps[0]), (&c, steps[1])]] {
+            let found = correlate(&a, others, region, &search);
+            for i in (0..3500).step_by(37) {
+                let at = [(i % 70) as i64, (i / 70) as i64];
+                let costs: Vec<u16> = (2..=9).map(|d| by_definition(&a, others, at, d, &search)).collect();
+                let best = costs.iter().enumerate().min_by_key(|(_, c)| **c).unwrap().0;
+                let rival = costs.iter().enumerate().filter(|(d, _)| d.abs_diff(best) > 1).map(|(_, c)| *c).min().unwrap();
+                let none = costs[best] >= 50 * 75 * others.len() as u16;
+                assert_eq!(found.best[i], if none { NO_MATCH } else { best as u16 + 2 });
+                assert_eq!((found.cost[i][1], found.rival[i]), (costs[best], rival));
+            }
+        }
+    }
+
+    #[test]
+    fn fractional_steps_find_the_shift() {
+        // A camera at 1.5 baselines: its picture is the reference moved by 1.5 d, here with d = 6.
+        let a = noise(4);
+        let moved = GrayImage::from_fn(70, 50, |x, y| if x + 9 < 70 { *a.get_pixel(x + 9, y) } else { Luma([0]) });
+        let search = Search { first: 0, last: 12, radius: 2, truncation: 50, occlusion_penalty: 3 };
+        let found = correlate(&a, &[(&moved, Vector2::new(-1.5, 0.0))], Region { x: [20, 60], y: [8, 40] }, &search);
+        assert!(found.best.iter().all(|&d| d == 6));
+    }
+
+    #[test]
+    fn no_texture_in_common_is_no_match() {
+        let search = Search { first: 0, last: 5, radius: 1, truncation: 20, occlusion_penalty: 0 };
+        let (dark, bright) = (GrayImage::from_pixel(70, 50, Luma([10])), GrayImage::from_pixel(70, 50, Luma([200])));
+        let found = correlate(&dark, &[(&bright, Vector2::new(-1.0, 0.0))], Region { x: [10, 20], y: [10, 20] }, &search);
+        assert!(found.best.iter().all(|&d| d == NO_MATCH));
+    }
 }

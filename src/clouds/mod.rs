@@ -2,9 +2,16 @@
 
 pub mod cloud;
 pub mod correlate;
+pub mod frame;
+pub mod masks;
 pub mod prefilter;
+pub mod stage;
 pub mod stereo;
 pub mod subpixel;
+pub mod tidy;
+pub mod triangulate;
 pub mod validate;
 
 pub use cloud::{Cloud, CloudPoint};
+pub use frame::{CloudError, CloudOptions, CloudRig, FrameCloud, frame_cloud};
+pub use stage::Stage;

@@ -11,10 +11,10 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 /// Wider lets the outline's contrast change the values of pixels further inside; narrower removes the texture itself.
-const SIGMA_PX: f32 = 4.0;
+const SIGMA_PX: f32 = 1.5;
 
 /// About twice the noise of an 8-bit camera, grey levels. Smaller amplifies noise on bare walls, larger forgets weak texture.
-const CONTRAST_FLOOR: f32 = 4.0;
+const CONTRAST_FLOOR: f32 = 5.0;
 
 /// Grey steps per unit of g: 3 standard deviations fill the 8 bits.
 const GAIN: f32 = 40.0;

@@ -19,7 +19,7 @@ use serde::Serialize;
 
 use crate::body::{Length, Pose, Shape};
 use crate::math::arrow::{LmOptions, minimise};
-use crate::motion_model::Model;
+use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
 use curve::Curve;
 use problem::{Fitness, Frame, Free, Known, Outside, Problem, Settings, fitness, total};
@@ -76,6 +76,8 @@ pub struct Fit {
     pub speed_m_s: f64,
     /// Mean rate of the phase, cycles per second.
     pub cadence_hz: f64,
+    /// Up direction of the rig's world.
+    pub up: Vector3<f64>,
 }
 
 /// Accelerations of a steady walk's carrier: larger values let noise through, smaller ones cut corners.
@@ -91,7 +93,7 @@ const SETTINGS: Settings = Settings {
     stature: 0.03,
     length: 0.025,
     arm_length: 0.05,
-    width: 0.12,
+    width: 0.08,
 };
 
 /// Steadiness of the phase while the start is still rough.
@@ -221,10 +223,22 @@ fn finish(run: Run, state: State, curve: Curve, frames: &[Frame], observations: 
     let travelled: f64 =
         state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.known.up * d.dot(&run.known.up)).norm()).sum();
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
-    Fit { poses, shared_covariance, frame_sigmas, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
+    let up = run.known.up;
+    Fit { up, poses, shared_covariance, frame_sigmas, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
 }
 
 impl Fit {
+    /// The motion parameter as filmed: mean speed in m/s, for a jump the length of its path in m.
+    pub fn parameter(&self, activity: Activity) -> f64 {
+        match (activity.is_cyclic(), self.poses.first(), self.poses.last()) {
+            (false, Some(first), Some(last)) => {
+                let way = last.root - first.root;
+                (way - self.up * way.dot(&self.up)).norm()
+            }
+            _ => self.speed_m_s,
+        }
+    }
+
     /// Shape of the person.
     pub fn shape(&self) -> &Shape {
         &self.state.shape

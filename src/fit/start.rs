@@ -54,15 +54,12 @@ pub struct Hypothesis {
 
 /// Track, heading and stature from the clouds.
 pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector3<f64>) -> Result<Track, FitError> {
-    let mut heights: Vec<f64> = observations.iter().flat_map(|o| o.cloud.points.iter().map(|p| p.position.dot(up))).collect();
     let seen: Vec<(f64, Vector3<f64>)> =
         observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS).map(|o| (o.time_s, median(o))).collect();
     if seen.len() < 5 {
         return Err(FitError::NobodySeen { frames: observations.len(), with_person: seen.len(), points: FEWEST_POINTS });
     }
-    heights.sort_by(f64::total_cmp);
-    let quantile = |q: f64| heights[((heights.len() - 1) as f64 * q) as usize];
-    let (floor, top) = (quantile(0.003), quantile(0.997));
+    let (floor, top) = extent(observations, up);
     let stature = (top - floor).clamp(1.2, 2.1);
     let horizontal = |v: Vector3<f64>| v - up * v.dot(up);
     let deeper: Vec<Vector3<f64>> =
@@ -85,12 +82,24 @@ pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector
     })
 }
 
+/// Heights of the lowest and highest point: quantiles of each cloud against stray points, then medians over the frames.
+fn extent(observations: &[Observation], up: &Vector3<f64>) -> (f64, f64) {
+    let quantiles = |q: f64| {
+        let clouds = observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS);
+        let values = clouds.map(|o| quantile(o.cloud.points.iter().map(|p| p.position.dot(up)).collect(), q));
+        quantile(values.collect(), 0.5)
+    };
+    (quantiles(0.003), quantiles(0.997))
+}
+
+/// The `q` quantile of at least one value.
+fn quantile(mut values: Vec<f64>, q: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[((values.len() - 1) as f64 * q) as usize]
+}
+
 fn median(observation: &Observation) -> Vector3<f64> {
-    Vector3::from_fn(|axis, _| {
-        let mut values: Vec<f64> = observation.cloud.points.iter().map(|p| p.position[axis]).collect();
-        values.sort_by(f64::total_cmp);
-        values[values.len() / 2]
-    })
+    Vector3::from_fn(|axis, _| quantile(observation.cloud.points.iter().map(|p| p.position[axis]).collect(), 0.5))
 }
 
 /// Least-squares parabola through points over time, twice reweighted against outliers; `None` if singular.

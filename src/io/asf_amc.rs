@@ -3,8 +3,7 @@
 //! A bone with axis rotation C and motion M (its degrees of freedom in the listed order, first applied first) has
 //!   world_from_bone = world_from_parent · C M C⁻¹,                                                   (1)
 //! identity at the zero pose, and ends at start + world_from_bone · direction · length. A [`RecordedJoint`] is a bone, placed at
-//! its start. Units: `length 0.45` means 1/0.45 inch per unit. AMC holds no frame rate: CMU's 120 Hz unless the file has a
-//! `:samples-per-second` line. A root offset other than zero is refused.
+//! its start. Units: `length 0.45` means 1/0.45 inch per unit. AMC holds no frame rate; CMU's is 120 Hz. A root offset other than zero is refused.
 //! Checked against an independent forward kinematics and the same trials as BVH.
 
 use std::collections::HashMap;
@@ -35,9 +34,9 @@ type Fault = (usize, String);
 pub fn read(amc: &Path) -> Result<Recording, AsfAmcError> {
     let asf = skeleton_beside(amc)?;
     let skeleton = parse_asf(&text(&asf)?).map_err(at(&asf))?;
-    let (fps, frames) = parse_amc(&text(amc)?, &skeleton).map_err(at(amc))?;
+    let frames = parse_amc(&text(amc)?, &skeleton).map_err(at(amc))?;
     let joints = skeleton.recorded_joints();
-    Ok(Recording { fps, metres_per_unit: Some(skeleton.metres_per_unit), joints, frames })
+    Ok(Recording { fps: FPS, metres_per_unit: Some(skeleton.metres_per_unit), joints, frames })
 }
 
 fn at(path: &Path) -> impl Fn(Fault) -> AsfAmcError {
@@ -255,10 +254,9 @@ fn assemble(root: Bone, texts: &[BoneText], children: &[(usize, String, Vec<Stri
     Ok(bones)
 }
 
-/// Frame rate and frames.
-fn parse_amc(text: &str, skeleton: &Skeleton) -> Result<(f64, Vec<RecordedFrame>), Fault> {
+fn parse_amc(text: &str, skeleton: &Skeleton) -> Result<Vec<RecordedFrame>, Fault> {
     let index: HashMap<&str, usize> = skeleton.bones.iter().enumerate().map(|(i, b)| (b.name.as_str(), i)).collect();
-    let (mut fps, mut degrees) = (FPS, skeleton.degrees);
+    let mut degrees = skeleton.degrees;
     let mut frames = Vec::new();
     let mut values: Vec<Option<Vec<f64>>> = Vec::new();
     let mut started = 0;
@@ -267,7 +265,6 @@ fn parse_amc(text: &str, skeleton: &Skeleton) -> Result<(f64, Vec<RecordedFrame>
         match (key.as_str(), &words[1..]) {
             (":degrees", _) => degrees = true,
             (":radians", _) => degrees = false,
-            (":samples-per-second", [rate, ..]) => fps = positive(rate, line)?,
             (other, _) if other.starts_with(':') => {}
             (_, []) if words[0].parse::<u64>().is_ok() => {
                 if started > 0 {
@@ -291,7 +288,7 @@ fn parse_amc(text: &str, skeleton: &Skeleton) -> Result<(f64, Vec<RecordedFrame>
     if started > 0 {
         frames.push(place(skeleton, &values, degrees, started)?);
     }
-    Ok((fps, frames))
+    Ok(frames)
 }
 
 /// Forward kinematics of one frame, equation (1).
@@ -324,4 +321,100 @@ fn place(skeleton: &Skeleton, values: &[Option<Vec<f64>>], degrees: bool, line: 
         frame.rotations.push(frame.rotations[p] * rotation);
     }
     Ok(frame)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::Joint;
+    use crate::io::read_clip;
+    use crate::math::rotation::{exp, log};
+
+    fn fixture(name: &str) -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/mocap").join(name)
+    }
+
+    #[test]
+    fn bent_joints_of_the_fixture_arrive_bent() {
+        let clip = read_clip(&fixture("tiny_01.amc")).unwrap().clip;
+        assert_eq!((clip.fps, clip.poses.len()), (120.0, 3));
+        assert!((clip.leg_m() - (7.5 + 7.2) * 0.0254 / 0.45).abs() < 1e-9);
+        let is = |frame: usize, joint: Joint, expected: [f64; 3]| {
+            let degrees = log(clip.poses[frame].joint(joint)) * 180.0 / std::f64::consts::PI;
+            assert!((degrees - Vector3::from(expected)).norm() < 1e-3, "frame {frame} {}: {degrees:?}", joint.name());
+        };
+        use Joint::*;
+        is(0, LHip, [0.0, 0.0, 20.0]);
+        is(0, RHip, [0.0, 0.0, -20.0]);
+        is(0, LShoulder, [0.0, 0.0, 90.0]);
+        is(0, LKnee, [0.0, 0.0, 0.0]);
+        for frame in [0, 1, 2] {
+            // Feet lean with the straddled leg: neutral against the shank.
+            is(frame, LAnkle, [0.0, 0.0, 0.0]);
+        }
+        is(1, LHip, [0.0, 0.0, 0.0]);
+        is(1, RHip, [0.0, 0.0, 0.0]);
+        is(2, LHip, [-30.0, 0.0, 0.0]);
+        is(2, LKnee, [60.0, 0.0, 0.0]);
+        let turned = clip.poses[1].world_from_root.angle_to(&exp(&Vector3::new(0.0, std::f64::consts::FRAC_PI_2, 0.0)));
+        assert!(turned < 1e-9);
+    }
+
+    /// Closed form: a bone with axis rotation Rz(20) turned by 60 degrees about its x moves its end in the plane it defines.
+    #[test]
+    fn a_bent_knee_carries_the_ankle_as_by_hand() {
+        let recording = read(&fixture("tiny_01.amc")).unwrap();
+        let at = |name: &str| recording.joints.iter().position(|j| j.name == name).unwrap();
+        let frame = &recording.frames[2];
+        let hip = frame.positions[at("lfemur")];
+        let [thigh, shank] = [30f64.to_radians(), 30f64.to_radians()];
+        let expected = Vector3::new(0.0, -7.5 * thigh.cos() - 7.2 * shank.cos(), 7.5 * thigh.sin() - 7.2 * shank.sin());
+        assert!((frame.positions[at("lfoot")] - hip - expected).norm() < 1e-5);
+    }
+
+    #[test]
+    fn faults_are_named_with_their_line() {
+        let asf = std::fs::read_to_string(fixture("tiny.asf")).unwrap();
+        let amc = std::fs::read_to_string(fixture("tiny_01.amc")).unwrap();
+        let skeleton = parse_asf(&asf).unwrap();
+        assert_eq!(parse_amc(&amc, &skeleton).unwrap().len(), 3);
+        let line_of = |text: &str, needle: &str| text.lines().position(|l| l.contains(needle)).unwrap() + 1;
+        for (bad, line, phrase) in [
+            (asf.replace("length 0.45", "length -1"), line_of(&asf, "length 0.45"), "'-1' must be positive"),
+            (asf.replace("length 7.2", "length long"), line_of(&asf, "length 7.2"), "'long' is not a number"),
+            (asf.replace("axis 0 0 20 XYZ", "axis 0 0 20 XYW"), line_of(&asf, "axis 0 0 20 XYZ"), "no order of axes"),
+            (asf.replace("dof ry", "dof by"), line_of(&asf, "dof ry"), "no degree of freedom"),
+            (asf.replace("ltibia lfoot", "ltibia lhoof"), line_of(&asf, "ltibia lfoot"), "'lhoof' is not in :bonedata"),
+            (asf.replace("    lfemur ltibia\n", ""), line_of(&asf, "ltibia lfoot") - 1, "'ltibia' is not yet"),
+            (asf.replace("orientation 0 0 0", "orientation 0 9 0"), line_of(&asf, "orientation"), "not supported"),
+            (asf.split(":hierarchy").next().unwrap().to_string(), line_of(&asf, ":hierarchy") - 1, ":hierarchy part is missing"),
+        ] {
+            let (at, what) = parse_asf(&bad).map(|_| ()).unwrap_err();
+            assert!(at == line && what.contains(phrase), "{at} instead of {line}: {what}");
+        }
+        for (bad, line, phrase) in [
+            (amc.replace("ltibia 60", "ltibia sixty"), line_of(&amc, "ltibia 60"), "'sixty' is not a number"),
+            (amc.replace("ltibia 60", "ltibia inf"), line_of(&amc, "ltibia 60"), "not a finite number"),
+            (amc.replace("ltibia 60", "ltibia 60 1"), line_of(&amc, "ltibia 60"), "2 values here where the skeleton has 1"),
+            (amc.replace("ltibia 60\n", ""), line_of(&amc, "ltibia 60") - 3, "no values for 'ltibia'"),
+            (amc.replacen("1\nroot", "root", 1), 4, "frame number belongs before"),
+        ] {
+            let (at, what) = parse_amc(&bad, &skeleton).map(|_| ()).unwrap_err();
+            assert!(at == line && what.contains(phrase), "{at} instead of {line}: {what}");
+        }
+        let error = read_clip(&fixture("tiny_02.amc")).map(|_| ()).unwrap_err().to_string();
+        assert!(error.ends_with("tiny_02.amc:10: bone 'rshin' is not in the skeleton"), "{error}");
+    }
+
+    #[test]
+    fn a_missing_skeleton_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let amc = folder.path().join("07_02.amc");
+        std::fs::copy(fixture("tiny_01.amc"), &amc).unwrap();
+        assert!(read(&amc).map(|_| ()).unwrap_err().to_string().contains("put 07.asf there"));
+        std::fs::copy(fixture("tiny.asf"), folder.path().join("whoever.asf")).unwrap();
+        assert!(read(&amc).is_ok());
+        std::fs::copy(fixture("tiny.asf"), folder.path().join("another.asf")).unwrap();
+        assert!(matches!(read(&amc), Err(AsfAmcError::NoSkeleton { .. })));
+    }
 }

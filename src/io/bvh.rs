@@ -56,7 +56,7 @@ fn parse(text: &str) -> Result<Recording, Fault> {
     let mut rest = lines.iter().enumerate().skip(end + 1).map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (declared, declared_line) = header(rest.next(), "Frames", lines.len())?;
     let (frame_time, line) = header(rest.next(), "Frame Time", lines.len())?;
-    if !(frame_time > 0.0) {
+    if frame_time <= 0.0 {
         return Err((line, format!("frame time {frame_time} is not positive; write seconds per frame")));
     }
     let frames = rest.map(|(line, text)| parse_frame(&hierarchy, line, text)).collect::<Result<Vec<_>, _>>()?;
@@ -308,4 +308,201 @@ fn zxy_near(rotation: &UnitQuaternion<f64>, previous: &[f64; 3]) -> [f64; 3] {
     let distance = |a: &[f64; 3]| a.iter().zip(previous).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
     let (main, other) = (near(main), near(other));
     if distance(&main) <= distance(&other) { main } else { other }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::Shape;
+    use crate::io::read_clip;
+    use crate::math::rotation::exp;
+    use nalgebra::Matrix4;
+
+    fn fixture(name: &str) -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/mocap").join(name)
+    }
+
+    /// Another way to read: one stream of words, homogeneous matrices by the textbook. Positions of the joints per frame.
+    fn plain_reader(text: &str) -> Vec<Vec<Vector3<f64>>> {
+        let words: Vec<&str> = text.split_whitespace().collect();
+        let num = |i: usize| words[i].parse::<f64>().unwrap();
+        let motion = words.iter().position(|w| *w == "MOTION").unwrap();
+        let (mut parents, mut offsets, mut channels) = (Vec::new(), Vec::new(), Vec::new());
+        let mut open: Vec<Option<usize>> = Vec::new();
+        for i in 0..motion {
+            match words[i] {
+                "ROOT" | "JOINT" => {
+                    parents.push(open.last().copied().flatten());
+                    offsets.push(Vector3::zeros());
+                    channels.push(Vec::new());
+                    open.push(Some(parents.len() - 1));
+                }
+                "End" => open.push(None),
+                "OFFSET" => {
+                    if let Some(j) = open.last().copied().flatten() {
+                        offsets[j] = Vector3::new(num(i + 1), num(i + 2), num(i + 3));
+                    }
+                }
+                "CHANNELS" => channels[parents.len() - 1] = words[i + 2..i + 2 + num(i + 1) as usize].to_vec(),
+                "}" => {
+                    open.pop();
+                }
+                _ => {}
+            }
+        }
+        let count = num(motion + 2) as usize;
+        let mut at = motion + 6;
+        (0..count)
+            .map(|_| {
+                let mut world: Vec<Matrix4<f64>> = Vec::new();
+                for j in 0..parents.len() {
+                    let (mut shift, mut turn) = (offsets[j], Matrix4::identity());
+                    for channel in &channels[j] {
+                        let (v, a) = (num(at), num(at).to_radians());
+                        at += 1;
+                        let (s, c) = a.sin_cos();
+                        match *channel {
+                            "Xposition" => shift.x = v,
+                            "Yposition" => shift.y = v,
+                            "Zposition" => shift.z = v,
+                            "Xrotation" => turn *= Matrix4::new(1., 0., 0., 0., 0., c, -s, 0., 0., s, c, 0., 0., 0., 0., 1.),
+                            "Yrotation" => turn *= Matrix4::new(c, 0., s, 0., 0., 1., 0., 0., -s, 0., c, 0., 0., 0., 0., 1.),
+                            _ => turn *= Matrix4::new(c, -s, 0., 0., s, c, 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.),
+                        }
+                    }
+                    let local = Matrix4::new_translation(&shift) * turn;
+                    world.push(parents[j].map_or(local, |p: usize| world[p] * local));
+                }
+                world.iter().map(|m| Vector3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)])).collect()
+            })
+            .collect()
+    }
+
+    fn assert_same_positions(path: &Path) {
+        let recording = read(path).unwrap();
+        let expected = plain_reader(&std::fs::read_to_string(path).unwrap());
+        assert_eq!(recording.frames.len(), expected.len());
+        for (frame, expected) in recording.frames.iter().zip(&expected) {
+            for (ours, theirs) in frame.positions.iter().zip(expected) {
+                assert!((ours - theirs).norm() < 1e-8 * (1.0 + theirs.norm()), "{}", path.display());
+            }
+        }
+    }
+
+    #[test]
+    fn forward_kinematics_equals_a_plain_matrix_reader() {
+        assert_same_positions(&fixture("tiny.bvh"));
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap");
+        if !data.is_dir() {
+            println!("skipped: no ../shared/data/mocap");
+            return;
+        }
+        for name in [
+            "cmu-bvh/09/09_01.bvh",
+            "bandai-namco-1/data/dataset-1_walk_normal_002.bvh",
+            "stylised-cmu-m21/content/walk.bvh",
+            "parser-torture/bvh/pybvh/bvh_data/bvh_example.bvh",
+            "parser-torture/bvh/pybvh/bvh_data/bvh_test2.bvh",
+            "parser-torture/bvh/pybvh/tests/fixtures/rotation_first_root.bvh",
+            "parser-torture/bvh/bvh-toolbox/source/walk01.bvh",
+            "parser-torture/bvh/ganimator/Elephant/idle1.bvh",
+        ] {
+            assert_same_positions(&data.join(name));
+        }
+    }
+
+    /// A person of odd proportions who turns twice about the vertical, bends sideways beyond 90 degrees and waves every joint.
+    fn dancing() -> Clip {
+        let mut shape = Shape::template(1.65);
+        for (i, length) in shape.lengths.iter_mut().enumerate() {
+            *length = 0.9 + 0.03 * i as f64;
+        }
+        let offsets = shape.offsets();
+        let pose = |frame: usize| {
+            let t = frame as f64 / 60.0;
+            let mut pose = Pose::rest(offsets[0] + Vector3::new(t, 0.1 * (9.0 * t).sin(), -2.0 * t));
+            pose.world_from_root = exp(&Vector3::new(0.0, 12.0 * t, 0.0)) * exp(&Vector3::new(1.9 * t, 0.0, 0.4));
+            for (k, rotation) in pose.joints.iter_mut().enumerate() {
+                let phase = 5.0 * t + k as f64;
+                *rotation = exp(&Vector3::new(phase.sin(), 0.8 * (1.3 * phase).cos(), -0.5 * (0.7 * phase).sin()));
+            }
+            pose
+        };
+        Clip { fps: 60.0, poses: (0..61).map(pose).collect(), offsets, hip_height_m: shape.hip_height_m() }
+    }
+
+    #[test]
+    fn a_written_clip_reads_back_here_and_elsewhere() {
+        let (clip, folder) = (dancing(), tempfile::tempdir().unwrap());
+        let path = folder.path().join("new/dance.bvh");
+        write_clip(&path, &clip, Some(&Rotation3::from_euler_angles(-1.5, 0.2, 0.0))).unwrap();
+        let back = read_clip(&path).unwrap().clip;
+        assert_eq!((back.fps, back.poses.len()), (clip.fps, clip.poses.len()));
+        assert!((back.hip_height_m - clip.hip_height_m).abs() < 1e-12);
+        let elsewhere = plain_reader(&std::fs::read_to_string(&path).unwrap());
+        let mut order = Vec::new();
+        depth_first(Joint::Root, &mut order);
+        for ((pose, back_pose), read) in clip.poses.iter().zip(&back.poses).zip(&elsewhere) {
+            let (placed, back_placed) = (clip.place(pose), back.place(back_pose));
+            for (joint, elsewhere) in order.iter().zip(read) {
+                assert!((placed.position(*joint) - back_placed.position(*joint)).norm() < 1e-5, "{}", joint.name());
+                assert!((placed.position(*joint) - elsewhere).norm() < 1e-5, "{}", joint.name());
+            }
+        }
+        let sidecar = Sidecar::beside(&path).unwrap();
+        assert_eq!((sidecar.length_unit.as_str(), sidecar.fps), ("m", 60.0));
+        let rows = sidecar.file_from_rig_world.unwrap();
+        assert!((rows[1][2] - Rotation3::from_euler_angles(-1.5, 0.2, 0.0)[(1, 2)]).abs() < 1e-12);
+    }
+
+    #[test]
+    fn written_angles_do_not_jump_by_whole_turns() {
+        let mut clip = dancing();
+        for (i, pose) in clip.poses.iter_mut().enumerate() {
+            pose.world_from_root = exp(&Vector3::new(0.0, 12.0 * i as f64 / 60.0, 0.0));
+        }
+        let text = text_of(&clip);
+        let y = |line: &str| line.split(' ').nth(5).and_then(|w| w.parse::<f64>().ok());
+        let turns: Vec<f64> = text.lines().skip_while(|l| !l.starts_with("Frame Time")).skip(1).filter_map(y).collect();
+        assert_eq!(turns.len(), 61);
+        assert!(turns.windows(2).all(|w| (w[1] - w[0] - 12f64.to_degrees() / 60.0).abs() < 1e-5), "{turns:?}");
+    }
+
+    #[test]
+    fn gimbal_lock_keeps_the_rotation() {
+        for sign in [1.0, -1.0] {
+            let lock = exp(&Vector3::new(0.0, 0.0, 0.7)) * exp(&Vector3::new(sign * std::f64::consts::FRAC_PI_2, 0.0, 0.0));
+            let [z, x, y] = zxy_near(&lock, &[0.1, 0.2, 0.3]);
+            let back = exp(&Vector3::new(0.0, 0.0, z)) * exp(&Vector3::new(x, 0.0, 0.0)) * exp(&Vector3::new(0.0, y, 0.0));
+            assert!(back.angle_to(&lock) < 1e-7, "{z} {x} {y}");
+        }
+    }
+
+    #[test]
+    fn faults_are_named_with_their_line() {
+        let good = std::fs::read_to_string(fixture("tiny.bvh")).unwrap();
+        assert!(parse(&good).is_ok());
+        assert!(parse(&good.replace('\n', "\r\n")).is_ok());
+        assert!(parse(&good.replace('\n', "\r")).is_ok());
+        let line_of = |needle: &str| good.lines().position(|l| l.contains(needle)).unwrap() + 1;
+        let last = good.lines().count();
+        for (bad, line, phrase) in [
+            (good.replace("OFFSET 9 -5 0", "OFFSET 9 x 0"), line_of("OFFSET 9 -5 0"), "'x' is not a number"),
+            (good.replace("JOINT LeftLeg", "JOIN LeftLeg"), line_of("JOINT LeftLeg"), "found 'JOIN'"),
+            (good.replace("3 Xrotation Yrotation", "3 Xrotation Yrot"), line_of("3 Xrotation Yrotation"), "'Yrot' is no channel"),
+            (good.replace("Frames: 3", "Frames: 4"), line_of("Frames: 3"), "4 frames are declared but 3"),
+            (good.replace("Frame Time: 0.0333333", "Frame Time: 0"), line_of("Frame Time"), "not positive"),
+            (good.replace(" 12 0 0 90", " nan 0 0 90"), last, "'nan' is not a finite number"),
+            (good.replace(" 12 0 0 90", " 12 0 90"), last, "65 values where the hierarchy has 66"),
+            (good.replace("MOTION", "MOTIONS"), last, "MOTION part is missing"),
+            (good.replace("HIERARCHY", "ROOT"), 1, "found 'ROOT' where 'HIERARCHY'"),
+            (good.replacen("\t}\n}", "\t}", 1), line_of("MOTION") - 2, "closing brace"),
+        ] {
+            let (at, what) = parse(&bad).map(|_| ()).unwrap_err();
+            assert_eq!(at, line, "{what}");
+            assert!(what.contains(phrase), "{what}");
+        }
+        let error = read(&fixture("cut.bvh")).map(|_| ()).unwrap_err().to_string();
+        assert!(error.ends_with("cut.bvh:128: 17 values where the hierarchy has 66 channels; the line is cut or wrapped"), "{error}");
+    }
 }

@@ -8,10 +8,9 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use super::is_motion_file;
 use crate::motion_model::Activity;
 
-/// File endings of motion files, lower case.
-pub const ENDINGS: [&str; 3] = ["amc", "bvh", "mot"];
 const MANIFEST: &str = "subjects.csv";
 
 /// One motion, or part of one.
@@ -29,15 +28,15 @@ pub struct Entry {
 
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
     #[error("{path} line 1 names no column `file`")]
     NoFileColumn { path: PathBuf },
     #[error("{path} line 1: unknown column `{column}`; known are file, subject, activity, speed_m_s, length_m, start_s, end_s")]
     Column { path: PathBuf, column: String },
     #[error("{path} line {line}: {why}")]
     Row { path: PathBuf, line: usize, why: String },
-    #[error("no motion file (.amc, .bvh, .mot) in {path}")]
+    #[error("no motion file (.amc, .bvh, .mot, .sto) in {path}")]
     Nothing { path: PathBuf },
 }
 
@@ -58,7 +57,7 @@ pub fn find_motions(inputs: &[PathBuf], manifest: Option<&Path>) -> Result<Vec<E
 }
 
 fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -> Result<(), ManifestError> {
-    let failed = |source| ManifestError::Read { path: path.to_path_buf(), source };
+    let failed = |cause| ManifestError::Read { path: path.to_path_buf(), cause };
     if !fs::metadata(path).map_err(failed)?.is_dir() {
         entries.push(plain(path));
         return Ok(());
@@ -74,15 +73,11 @@ fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -
     let mut children: Vec<PathBuf> = fs::read_dir(path).map_err(failed)?.filter_map(|e| Some(e.ok()?.path())).collect();
     children.sort_by(|a, b| natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then(a.cmp(b)));
     for child in children {
-        if child.is_dir() || has_motion_ending(&child) {
+        if child.is_dir() || is_motion_file(&child) {
             search(&child, entries, seen)?;
         }
     }
     Ok(())
-}
-
-fn has_motion_ending(path: &Path) -> bool {
-    path.extension().is_some_and(|e| ENDINGS.contains(&e.to_string_lossy().to_lowercase().as_str()))
 }
 
 fn plain(path: &Path) -> Entry {
@@ -92,7 +87,7 @@ fn plain(path: &Path) -> Entry {
 
 /// The rows of a `subjects.csv`.
 pub fn read_manifest(path: &Path) -> Result<Vec<Entry>, ManifestError> {
-    let text = fs::read_to_string(path).map_err(|source| ManifestError::Read { path: path.to_path_buf(), source })?;
+    let text = fs::read_to_string(path).map_err(|cause| ManifestError::Read { path: path.to_path_buf(), cause })?;
     let mut lines = text.trim_start_matches('\u{feff}').lines();
     let columns: Vec<String> = cells(lines.next().unwrap_or_default());
     let known = ["file", "subject", "activity", "speed_m_s", "length_m", "start_s", "end_s"];

@@ -3,7 +3,9 @@
 pub mod asf_amc;
 pub mod atomic;
 pub mod fit_json;
+pub mod joints_csv;
 pub mod pfm;
+pub mod ply;
 
 pub mod calib_toml;
 

@@ -35,10 +35,10 @@ const ROOT: usize = SAMPLES * ROOT_CHANNELS;
 
 #[derive(Debug, thiserror::Error)]
 pub enum ModelFileError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
-    #[error("cannot write {path}: {source}")]
-    Write { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
+    #[error("cannot write {path}: {cause}")]
+    Write { path: PathBuf, cause: std::io::Error },
     #[error("{path} is no model file of muybridge ({why}); `muybridge model build` makes one")]
     Foreign { path: PathBuf, why: String },
     #[error("{path} is a model of version {found}, this program reads {VERSION}; build it again")]
@@ -141,7 +141,7 @@ pub fn model_hash(model: &Model) -> String {
 
 /// Writes a model; the same model gives the same bytes.
 pub fn write_model(path: &Path, model: &Model) -> Result<(), ModelFileError> {
-    let failed = |source| ModelFileError::Write { path: path.to_path_buf(), source };
+    let failed = |cause| ModelFileError::Write { path: path.to_path_buf(), cause };
     let bytes = encode(model).map_err(failed)?;
     write_atomic(path, &bytes).map_err(failed)
 }
@@ -150,11 +150,15 @@ fn encode(model: &Model) -> std::io::Result<Vec<u8>> {
     let arrays = arrays(model);
     let mut header = Header::of(model);
     header.blake3 = hash(&header, &arrays);
+    archive(&header, arrays)
+}
+
+fn archive(header: &Header, arrays: Vec<Array>) -> std::io::Result<Vec<u8>> {
     let options = || {
         zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored).last_modified_time(zip::DateTime::default())
     };
     let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-    let json = serde_json::to_vec_pretty(&header)?;
+    let json = serde_json::to_vec_pretty(header)?;
     let mut writer = npz.array::<u8>("header", options())?.default_dtype().shape(&[json.len() as u64]).begin_nd()?;
     writer.extend(json)?;
     writer.finish()?;
@@ -169,7 +173,7 @@ fn encode(model: &Model) -> std::io::Result<Vec<u8>> {
 
 /// Reads a model and checks kind, version, skeleton, shapes and hash.
 pub fn read_model(path: &Path) -> Result<Model, ModelFileError> {
-    let file = File::open(path).map_err(|source| ModelFileError::Read { path: path.to_path_buf(), source })?;
+    let file = File::open(path).map_err(|cause| ModelFileError::Read { path: path.to_path_buf(), cause })?;
     let npz = NpzArchive::new(BufReader::new(file))
         .map_err(|e| ModelFileError::Foreign { path: path.to_path_buf(), why: format!("not an .npz archive: {e}") })?;
     Reader { path, npz }.model()
@@ -288,5 +292,68 @@ impl<R: Read + Seek> Reader<'_, R> {
             return Err(self.damaged("its content does not match its hash"));
         }
         Ok(model)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion_model::synthetic;
+
+    fn model() -> Model {
+        let cycles: Vec<_> = (1..3).flat_map(|s| [0.9, 1.4].map(|v| synthetic::subject(Activity::Walking, s).cycle(v, 0))).collect();
+        Model::build(Activity::Walking, true, &cycles).unwrap()
+    }
+
+    #[test]
+    fn comes_back_bit_for_bit_and_has_one_file_only() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("m.npz");
+        let model = model();
+        write_model(&path, &model).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        let read = read_model(&path).unwrap();
+        assert_eq!((read.activity, read.synthetic), (Activity::Walking, true));
+        assert_eq!((&read.mean, &read.basis, &read.root_basis), (&model.mean, &model.basis, &model.root_basis));
+        assert_eq!((&read.eigenvalues, read.mean_rotations), (&model.eigenvalues, model.mean_rotations));
+        assert_eq!(read.members[3].vector, model.members[3].vector);
+        assert_eq!(read.members[3].source, model.members[3].source);
+        write_model(&path, &read).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), bytes);
+        assert_eq!(model_hash(&read), model_hash(&model));
+    }
+
+    /// The model's archive with one array or the header changed.
+    fn altered(change: impl Fn(&mut Header, &mut Vec<Array>)) -> Vec<u8> {
+        let model = model();
+        let (mut header, mut arrays) = (Header::of(&model), arrays(&model));
+        header.blake3 = hash(&header, &arrays);
+        change(&mut header, &mut arrays);
+        archive(&header, arrays).unwrap()
+    }
+
+    #[test]
+    fn damaged_and_foreign_files_are_named_as_such() {
+        let dir = tempfile::tempdir().unwrap();
+        let whole = encode(&model()).unwrap();
+        let mut flipped = whole.clone();
+        flipped[whole.len() / 2] ^= 1;
+        let cases: [(&str, Vec<u8>); 9] = [
+            ("not an .npz archive", whole[..whole.len() / 2].to_vec()),
+            ("not an .npz archive", b"hello".to_vec()),
+            ("is damaged", flipped),
+            ("another skeleton (smpl)", altered(|h, _| h.skeleton = "smpl".into())),
+            ("version 7", altered(|h, _| h.version = 7)),
+            ("another skeleton", altered(|h, _| drop(h.joints.pop()))),
+            ("array `roots`: missing", altered(|_, a| a.retain(|a| a.name != "roots"))),
+            ("array `mean_rotations`: shape", altered(|_, a| a[0].shape = vec![104])),
+            ("does not match its hash", altered(|_, a| a[1].values[5] += 1e-9)),
+        ];
+        for (part, bytes) in cases {
+            let path = dir.path().join("x.npz");
+            std::fs::write(&path, bytes).unwrap();
+            let message = read_model(&path).unwrap_err().to_string();
+            assert!(message.contains(part) && message.contains("x.npz") && !message.contains('\n'), "{part}: {message}");
+        }
     }
 }

@@ -96,17 +96,17 @@ fn parse(text: &str) -> Result<(Table, Vec<String>), Fault> {
             break;
         }
         simm |= lower.contains("simm motion file") || lower.starts_with("datacolumns");
-        match lower.split_once(['=', ' ']).map(|(k, v)| (k.trim(), v.trim())) {
+        match lower.split_once(['=', ' ']).map(|(k, v)| (k.trim(), v.trim_matches(['=', ' ']))) {
             Some(("nrows" | "datarows", value)) => declared = value.parse::<usize>().ok().map(|n| (line, n)),
             Some(("indegrees", value)) => degrees = Some(value == "yes"),
             _ => {}
         }
     }
     let mut lines = lines.filter(|(_, l)| !l.is_empty());
-    let (_, names) = lines.next().ok_or((header_end, "no column names after 'endheader'; the file is cut short".to_string()))?;
+    let (names_line, names) = lines.next().ok_or((header_end, "no column names after 'endheader'; the file is cut short".to_string()))?;
     let names: Vec<String> = names.split_whitespace().map(coordinate).collect();
     if names.first().map(String::as_str) != Some("time") {
-        return Err((header_end + 1, "the first column must be 'time'".into()));
+        return Err((names_line, "the first column must be 'time'".into()));
     }
     let all = lines.map(|(line, text)| parse_row(&names, line, text)).collect::<Result<Vec<_>, _>>()?;
     if let Some((line, n)) = declared.filter(|&(_, n)| n != all.len()) {
@@ -264,4 +264,156 @@ fn stature_of(poses: &[Pose], origins: &[Vector3<f64>]) -> Result<f64, String> {
         return Ok(stature);
     }
     Err(format!("pelvis_ty implies a stature of {stature:.2} m; it must be the pelvis' height in metres above the floor y = 0"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::math::rotation::log;
+
+    fn fixture(name: &str) -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures/mocap").join(name)
+    }
+
+    fn degrees(q: &UnitQuaternion<f64>) -> Vector3<f64> {
+        log(q) * 180.0 / std::f64::consts::PI
+    }
+
+    fn clip_from(text: &str) -> Clip {
+        let (table, _) = parse(text).unwrap();
+        clip_of(&table, frame_rate(&table).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn bent_joints_of_the_fixture_arrive_bent() {
+        let (clip, notices) = read(&fixture("tiny.mot")).unwrap();
+        assert!(notices.is_empty());
+        assert_eq!((clip.fps, clip.poses.len()), (100.0, 4));
+        // Standing straight, the soles are on the floor and the pelvis' origin 0.95 m above it.
+        assert!(clip.sole_height(&clip.poses[0]).abs() < 1e-9);
+        let stature = 0.95 / (0.530 - HIP_UP);
+        assert!((clip.hip_height_m - 0.530 * stature).abs() < 1e-9);
+        let is = |frame: usize, joint: Joint, expected: [f64; 3]| {
+            let rotation = degrees(clip.poses[frame].joint(joint));
+            assert!((rotation - Vector3::from(expected)).norm() < 1e-4, "frame {frame} {}: {rotation:?}", joint.name());
+        };
+        use Joint::*;
+        for joint in Joint::ALL.into_iter().skip(1) {
+            is(0, joint, [0.0; 3]);
+        }
+        is(1, LHip, [-30.0, 0.0, 0.0]);
+        is(1, LKnee, [60.0, 0.0, 0.0]);
+        // Leaning forward, the right arm forward, turned to the left with the world's X now to the person's right.
+        is(2, Vl5, [10.0, 0.0, 0.0]);
+        is(2, RShoulder, [-20.0, 0.0, 0.0]);
+        assert!((degrees(&clip.poses[2].world_from_root) - Vector3::new(0.0, 90.0, 0.0)).norm() < 1e-6);
+        assert!((clip.poses[2].root.z - clip.poses[2].root.z.max(0.1)).abs() < 1e-9 && clip.poses[2].root.x.abs() > 0.01);
+        // Abduction: away from the body on both sides.
+        is(3, LShoulder, [0.0, 0.0, 20.0]);
+        is(3, RShoulder, [0.0, 0.0, -20.0]);
+        is(3, LHip, [0.0, 0.0, 15.0]);
+        assert!(degrees(clip.poses[3].joint(LAnkle)).x < -19.0, "dorsiflexion lifts the toes");
+    }
+
+    #[test]
+    fn knee_sign_and_radians_follow_the_file() {
+        let text = std::fs::read_to_string(fixture("tiny.mot")).unwrap();
+        let expected = clip_from(&text);
+        let (head, body) = text.split_at(text.find("\n0.000000").unwrap() + 1);
+        let converted = |convert: &dyn Fn(&str, f64) -> f64| -> String {
+            let names: Vec<&str> = head.lines().last().unwrap().split('\t').collect();
+            let row = |l: &str| l.split('\t').zip(&names).map(|(w, n)| convert(n, w.parse().unwrap()).to_string()).collect::<Vec<_>>();
+            body.lines().map(|l| row(l).join("\t") + "\n").collect()
+        };
+        let old_knee = head.to_string() + &converted(&|n, v| if n.starts_with("knee") { -v } else { v });
+        let length = |n: &str| n == "time" || n.starts_with("pelvis_t") && n != "pelvis_tilt";
+        let radians = head.replace("inDegrees=yes", "inDegrees=no") + &converted(&|n, v| if length(n) { v } else { v.to_radians() });
+        let simm = head.replace("inDegrees=yes", "# SIMM Motion File Header:\ndatacolumns 28") + body;
+        let states = text.replace("hip_flexion_l", "/jointset/hip_l/hip_flexion_l/value");
+        for (what, text) in [("knee", old_knee), ("radians", radians), ("simm", simm), ("states", states)] {
+            let clip = clip_from(&text);
+            for (a, b) in clip.poses.iter().zip(&expected.poses) {
+                let largest = a.joints.iter().zip(&b.joints).map(|(a, b)| a.angle_to(b)).fold(0.0, f64::max);
+                assert!(largest < 1e-7 && (a.root - b.root).norm() < 1e-7, "{what}: {largest}");
+            }
+        }
+    }
+
+    #[test]
+    fn faults_are_named_with_row_and_column() {
+        let good = std::fs::read_to_string(fixture("tiny.mot")).unwrap();
+        for (bad, line, phrase) in [
+            (good.replace("nRows=4", "nRows=5"), 3, "5 rows are declared but 4 follow"),
+            (good.replace("60.000000", "NaN"), 10, "column knee_angle_l holds NaN"),
+            (good.replace("60.000000", "sixty"), 10, "column knee_angle_l holds 'sixty'"),
+            (good.replace("\t60.000000", ""), 10, "27 values where the table has 28 columns"),
+            (good.replace("0.020000\t", "0.005000\t"), 11, "time runs back"),
+            (good.replace("time\t", "t\t"), 8, "first column must be 'time'"),
+            (good.replace("endheader", "end"), 12, "no column names after 'endheader'"),
+        ] {
+            let (at, what) = parse(&bad).map(|_| ()).unwrap_err();
+            assert!(at == line && what.contains(phrase), "{at} instead of {line}: {what}");
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.sto");
+        for (bad, phrase) in [
+            (good.replace("knee_angle_l", "knee_l"), "no column knee_angle_l;"),
+            (good.replace("0.950000", "0.000000"), "pelvis_ty implies a stature"),
+            (good.replace("0.030000\t", "0.060000\t"), "resample at a constant rate"),
+        ] {
+            std::fs::write(&path, bad).unwrap();
+            let error = read(&path).map(|_| ()).unwrap_err().to_string();
+            assert!(error.contains(phrase), "{error}");
+        }
+        std::fs::write(&path, good.replace("0.030000\t", "0.020000\t")).unwrap();
+        let (clip, notices) = read(&path).unwrap();
+        assert_eq!((clip.poses.len(), notices.len()), (3, 1));
+    }
+
+    /// Marker names and positions per frame in our axes, metres.
+    fn markers(path: &Path) -> (Vec<String>, Vec<Vec<Vector3<f64>>>) {
+        let text = std::fs::read_to_string(path).unwrap();
+        let lines: Vec<&str> = text.lines().collect();
+        let names = lines[3].split('\t').skip(2).filter(|w| !w.trim().is_empty()).map(str::to_string).collect();
+        let row = |line: &str| {
+            let values: Vec<f64> = line.split('\t').skip(2).map(|w| w.trim().parse().unwrap_or(f64::NAN)).collect();
+            values.chunks_exact(3).map(|c| ours([c[0], c[1], c[2]]) / 1000.0).collect()
+        };
+        let is_row = |l: &&&str| l.split('\t').next().is_some_and(|w| w.trim().parse::<u32>().is_ok());
+        (names, lines[5..].iter().filter(is_row).map(|l| row(l)).collect())
+    }
+
+    /// The runners' own markers are the truth that no angle convention can bend: elbows and ankles lie between theirs.
+    #[test]
+    fn joints_lie_between_the_runners_markers() {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap/hamner-running");
+        if !data.is_dir() {
+            println!("skipped: no ../shared/data/mocap/hamner-running");
+            return;
+        }
+        for (trial, pairs) in [
+            ("subject01/{}/Run_3", vec![("RLEL", "RMEL", Joint::RElbow), ("LLEL", "LMEL", Joint::LElbow)]),
+            (
+                "subject03/{}/Run_4",
+                vec![("RLEL", "RMEL", Joint::RElbow), ("LLEL", "LMEL", Joint::LElbow), ("RLMAL", "RMMAL", Joint::RAnkle)],
+            ),
+        ] {
+            let (clip, _) = read(&data.join(trial.replace("{}", "ik") + ".mot")).unwrap();
+            let (names, frames) = markers(&data.join(trial.replace("{}", "expData") + ".trc"));
+            assert_eq!(clip.poses.len(), frames.len());
+            for (outer, inner, joint) in pairs {
+                let at = |name: &str| names.iter().position(|n| n == name).unwrap();
+                let off = |(pose, markers): (&Pose, &Vec<Vector3<f64>>)| {
+                    clip.place(pose).position(joint) - 0.5 * (markers[at(outer)] + markers[at(inner)])
+                };
+                let errors: Vec<Vector3<f64>> = clip.poses.iter().zip(&frames).map(off).filter(|e| e.x.is_finite()).collect();
+                assert!(errors.len() > 300);
+                let mean = errors.iter().sum::<Vector3<f64>>() / errors.len() as f64;
+                let spread = (errors.iter().map(|e| (e - mean).norm_squared()).sum::<f64>() / errors.len() as f64).sqrt();
+                println!("{trial} {}: mean {:.0} mm, spread {:.0} mm", joint.name(), 1e3 * mean.norm(), 1e3 * spread);
+                // The elbow swings through more than 300 mm, the ankle through more than 800.
+                assert!(mean.norm() < 0.045 && spread < 0.025, "{trial} {}: {mean:?} {spread}", joint.name());
+            }
+        }
+    }
 }

@@ -7,16 +7,16 @@ use crate::style::Style;
 
 #[derive(Debug, thiserror::Error)]
 pub enum StyleFileError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
-    #[error("cannot write {path}: {source}")]
-    Write { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
+    #[error("cannot write {path}: {cause}")]
+    Write { path: PathBuf, cause: std::io::Error },
     #[error("{path} is no style file: {why}")]
     Parse { path: PathBuf, why: String },
 }
 
 pub fn read_style(path: &Path) -> Result<Style, StyleFileError> {
-    let text = std::fs::read_to_string(path).map_err(|source| StyleFileError::Read { path: path.to_path_buf(), source })?;
+    let text = std::fs::read_to_string(path).map_err(|cause| StyleFileError::Read { path: path.to_path_buf(), cause })?;
     let failed = |why: String| StyleFileError::Parse { path: path.to_path_buf(), why };
     let style: Style = serde_json::from_str(&text).map_err(|e| failed(e.to_string()))?;
     let positive = [style.hip_height_m, style.cadence_factor];
@@ -27,7 +27,7 @@ pub fn read_style(path: &Path) -> Result<Style, StyleFileError> {
 }
 
 pub fn write_style(path: &Path, style: &Style) -> Result<(), StyleFileError> {
-    let failed = |source| StyleFileError::Write { path: path.to_path_buf(), source };
+    let failed = |cause| StyleFileError::Write { path: path.to_path_buf(), cause };
     let mut text = serde_json::to_string_pretty(style).map_err(|e| failed(e.into()))?;
     text.push('\n');
     write_atomic(path, text.as_bytes()).map_err(failed)

@@ -64,7 +64,8 @@ fn slope(before: (f64, f64), here: (f64, f64), after: (f64, f64)) -> f64 {
     (w0 + w1) / (w0 / d0 + w1 / d1)
 }
 
-fn hermite(a: &[f64; 3], b: &[f64; 3], x: f64) -> f64 {
+/// The cubic through two points `[x, y, slope]`.
+pub fn hermite(a: &[f64; 3], b: &[f64; 3], x: f64) -> f64 {
     let h = b[0] - a[0];
     let t = (x - a[0]) / h;
     let (t2, t3) = (t * t, t * t * t);

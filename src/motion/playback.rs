@@ -29,6 +29,8 @@ pub struct Synthesis {
     pub hip_height_m: f64,
     /// Cycles (jumps) per second.
     pub frequency_hz: f64,
+    /// Database subjects and their weights in equation (8).
+    pub shares: Vec<(String, f64)>,
     pub notice: Option<String>,
 }
 
@@ -52,7 +54,7 @@ pub fn synthesize(
     let at_own_size = parameter * style.hip_height_m / hip_height_m;
     let found = extrapolate(population, metric, &style.weights, style.parameter, at_own_size)?;
     let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(parameter, hip_height_m);
-    Ok(Synthesis { weights: found.weights, parameter, hip_height_m, frequency_hz, notice: found.notice })
+    Ok(Synthesis { weights: found.weights, parameter, hip_height_m, frequency_hz, shares: found.shares, notice: found.notice })
 }
 
 /// Plays at `fps` from the start of a cycle; `offsets` are those of the body that moves.
@@ -86,4 +88,72 @@ fn stretch(model: &Model, synthesis: &Synthesis) -> f64 {
     let (_, end) = model.posture(synthesis.weights.as_slice(), 1.0);
     let factor = synthesis.parameter / (end.position.z * synthesis.hip_height_m);
     if STRETCH.contains(&factor) { factor } else { 1.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::Shape;
+    use crate::motion_model::{Activity, Label, Model, segment, synthetic};
+
+    fn model() -> Model {
+        let speeds = [0.9, 1.2, 1.5, 1.8];
+        let cycles: Vec<_> = (1..5).flat_map(|seed| speeds.map(|v| synthetic::subject(Activity::Walking, seed).cycle(v, 0))).collect();
+        Model::build(Activity::Walking, true, &cycles).unwrap()
+    }
+
+    fn style(model: &Model) -> Style {
+        let cycle = synthetic::subject(Activity::Walking, 7).mean_cycle(1.2);
+        Style::of_cycles(model, "", &[cycle]).unwrap()
+    }
+
+    #[test]
+    fn walks_at_the_wanted_speed_and_cadence_in_every_size() {
+        let model = model();
+        let style = style(&model);
+        let population = Population::new(&model, style.weights.len());
+        for (speed, hip_height_m) in [(0.9, style.hip_height_m), (1.37, style.hip_height_m), (1.2, 0.7)] {
+            let s = synthesize(&model, &population, Metric::Paper, &style, speed, hip_height_m).unwrap();
+            let clip = play(&model, &s, &Shape::template(hip_height_m / 0.53).offsets(), 100.0, Length::Cycles(5));
+            let seconds = (clip.poses.len() - 1) as f64 / clip.fps;
+            let way = clip.poses[clip.poses.len() - 1].root - clip.poses[0].root;
+            assert!((way.z / seconds / speed - 1.0).abs() < 0.01 && way.x.abs() < 0.01, "{speed}: {way:?} in {seconds}");
+            // An independent reading: cut the clip again and measure.
+            let label =
+                Label { subject: "x".into(), source: "x".into(), activity: Activity::Walking, parameter: None, start_s: None, end_s: None };
+            let cycles = segment(&clip, &label).unwrap().cycles;
+            assert!(cycles.len() >= 3, "{}", cycles.len());
+            assert!(cycles.iter().all(|c| (c.parameter / speed - 1.0).abs() < 0.01), "{speed}");
+            assert!(cycles.iter().all(|c| (c.duration_s * s.frequency_hz - 1.0).abs() < 0.01));
+        }
+    }
+
+    #[test]
+    fn the_observed_cadence_comes_back_at_the_observed_speed() {
+        let model = model();
+        let style = style(&model);
+        let own = synthetic::subject(Activity::Walking, 7).mean_cycle(1.2);
+        let population = Population::new(&model, style.weights.len());
+        let s = synthesize(&model, &population, Metric::Paper, &style, 1.2, style.hip_height_m).unwrap();
+        assert!((s.frequency_hz * own.duration_s - 1.0).abs() < 1e-9);
+        assert!((style.cadence_factor - 1.0).abs() > 1e-3, "the subject's own factor is to be seen");
+    }
+
+    #[test]
+    fn a_database_subject_plays_its_own_postures() {
+        let model = model();
+        let member = model.members[5].clone();
+        let style = Style::of_cycles(&model, "", &[model.cycle_of(&member)]).unwrap();
+        let population = Population::new(&model, style.weights.len());
+        let s = synthesize(&model, &population, Metric::Paper, &style, member.parameter, member.hip_height_m).unwrap();
+        let clip = play(&model, &s, &Shape::template(1.7).offsets(), 100.0, Length::Seconds(0.5));
+        assert_eq!(clip.poses.len(), 51);
+        let expected = model.cycle(model.member_weights(&member).as_slice(), "", member.parameter, member.hip_height_m, member.duration_s);
+        for (i, pose) in clip.poses.iter().enumerate() {
+            let at = i as f64 * s.frequency_hz;
+            let (k, part) = (at as usize, at - at.floor());
+            let knee = expected.joints[k][6].slerp(&expected.joints[(k + 1) % 100][6], part);
+            assert!(pose.joints[6].angle_to(&knee) < 1e-3);
+        }
+    }
 }

@@ -12,6 +12,8 @@ use super::model::Member;
 
 /// Spread (standard deviation) of log V below which the slope is not fitted: it would be noise.
 const SPREAD_FOR_SLOPE: f64 = 0.1;
+/// Members below this V are left out of the fit: a jump on the spot has no logarithm worth fitting.
+const SMALLEST_V: f64 = 0.2;
 
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CadenceLaw {
@@ -31,12 +33,12 @@ impl CadenceLaw {
         CadenceLaw { activity, a, b }
     }
 
-    /// Fit to the members of a model; members without a positive parameter are left out.
+    /// Fit to the members of a model; members that hardly move forward are left out.
     pub fn fit(activity: Activity, members: &[Member]) -> CadenceLaw {
         let prior = CadenceLaw::prior(activity);
         let points: Vec<(f64, f64)> = members
             .iter()
-            .filter(|m| m.parameter > 0.0 && m.duration_s > 0.0)
+            .filter(|m| m.parameter > SMALLEST_V * m.hip_height_m && m.duration_s > 0.0)
             .map(|m| ((m.parameter / m.hip_height_m).ln(), (prior.scale(m.hip_height_m) / m.duration_s).ln()))
             .collect();
         if points.is_empty() {
@@ -52,7 +54,7 @@ impl CadenceLaw {
 
     /// Cycles (jumps) per second at `parameter` (m/s, for jumps m) for a body with this hip height.
     pub fn frequency_hz(&self, parameter: f64, hip_height_m: f64) -> f64 {
-        self.a * (parameter.max(1e-3) / hip_height_m).powf(self.b) / self.scale(hip_height_m)
+        self.a * (parameter / hip_height_m).max(SMALLEST_V).powf(self.b) / self.scale(hip_height_m)
     }
 
     /// √H where the law is that of f·√H.

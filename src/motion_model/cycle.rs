@@ -25,6 +25,16 @@ impl Activity {
     }
 }
 
+impl std::fmt::Display for Activity {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.pad(match self {
+            Activity::Walking => "walking",
+            Activity::Running => "running",
+            Activity::Jumping => "jumping",
+        })
+    }
+}
+
 /// The root against its carrier, a frame that moves with the heading and the mean speed of the cycle at the standing
 /// hip height: x left, y up, z forward.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -61,7 +61,7 @@ pub enum ModelError {
     TooFew(usize),
     #[error("{origin} has {found} samples, a cycle has {SAMPLES}")]
     Samples { origin: String, found: usize },
-    #[error("{origin} is {found:?}, the model is for {wanted:?}")]
+    #[error("{origin} is {found}, the model is for {wanted}")]
     Activity { origin: String, found: Activity, wanted: Activity },
     #[error("all cycles of the database are equal, there is nothing to model")]
     NoVariance,
@@ -312,4 +312,97 @@ fn rotations(means: &[UnitQuaternion<f64>; BALL_JOINTS], coordinates: DVectorVie
 
 fn root_sample(c: DVectorView<f64>) -> RootSample {
     RootSample { rotation: Vector3::new(c[0], c[1], c[2]), position: Vector3::new(c[3], c[4], c[5]) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion_model::synthetic;
+
+    /// A few cycles of three synthetic walkers.
+    fn cycles() -> Vec<Cycle> {
+        let speeds = [0.9, 1.3, 1.7];
+        (1..4).flat_map(|seed| speeds.map(|v| synthetic::subject(Activity::Walking, seed).cycle(v, 0))).collect()
+    }
+
+    fn model() -> Model {
+        Model::build(Activity::Walking, true, &cycles()).unwrap()
+    }
+
+    #[test]
+    fn all_components_give_a_member_back() {
+        let model = model();
+        let vectors: Vec<_> = model.members.iter().map(|m| m.vector.clone()).collect();
+        let full = pca(&DMatrix::from_columns(&vectors));
+        for member in &model.members {
+            let alpha = full.basis.tr_mul(&(&member.vector - &full.mean));
+            assert!((&full.mean + &full.basis * alpha - &member.vector).norm() < 1e-9);
+            // What the stored components leave out is at most the variance that they do not hold.
+            let kept = model.vector(model.member_weights(member).as_slice());
+            let total: f64 = model.eigenvalues.iter().sum();
+            assert!((kept - &member.vector).norm_squared() <= (1.0 - STORED_VARIANCE) * total * model.members.len() as f64);
+        }
+        let back = model.cycle_of(&model.members[4]);
+        assert!((model.vector_of(&back) - &model.members[4].vector).norm() < 1e-9);
+        let angle = back.joints[30][1].angle_to(&cycles()[4].joints[30][1]);
+        assert!(angle < 1e-9, "{angle}");
+    }
+
+    #[test]
+    fn mean_rotations_leave_vectors_without_mean_angle() {
+        let model = model();
+        for joint in 0..BALL_JOINTS {
+            let mut sum = Vector3::zeros();
+            for sample in 0..SAMPLES {
+                sum += model.mean.fixed_rows::<3>((sample * BALL_JOINTS + joint) * 3);
+            }
+            assert!(sum.norm() / (SAMPLES as f64) < 1e-9, "joint {joint}");
+        }
+        assert!(model.mean.amax() > 0.1);
+    }
+
+    #[test]
+    fn root_loadings_leave_residuals_orthogonal_to_the_weights() {
+        let model = model();
+        let count = model.basis.ncols();
+        let mut products = DMatrix::<f64>::zeros(SAMPLES * ROOT_CHANNELS, count);
+        let (mut before, mut after) = (0.0, 0.0);
+        for member in &model.members {
+            let alpha = model.member_weights(member);
+            let residual = &member.root - model.root(alpha.as_slice());
+            before += (&member.root - &model.root_mean).norm_squared();
+            after += residual.norm_squared();
+            products += residual * alpha.transpose();
+        }
+        assert!(products.amax() < 1e-9, "{}", products.amax());
+        assert!(after < 0.2 * before, "{after} of {before}");
+    }
+
+    #[test]
+    fn postures_are_samples_and_interpolate_between_them_around_the_wrap() {
+        let model = model();
+        let alpha = model.member_weights(&model.members[0]);
+        let cycle = model.cycle(alpha.as_slice(), "s", 0.9, 0.9, 1.2);
+        let (joints, root) = model.posture(alpha.as_slice(), 3.37);
+        assert!(joints[2].angle_to(&cycle.joints[37][2]) < 1e-9);
+        assert!((root.position - cycle.root[37].position).norm() < 1e-12);
+        let (between, _) = model.posture(alpha.as_slice(), -0.005);
+        let half = cycle.joints[99][2].slerp(&cycle.joints[0][2], 0.5);
+        assert!(between[2].angle_to(&half) < 1e-4 && between[2].angle_to(&cycle.joints[0][2]) > 1e-4);
+        let jump = Model { activity: Activity::Jumping, ..model };
+        assert_eq!(jump.posture(alpha.as_slice(), 1.7), jump.posture(alpha.as_slice(), 1.0));
+        assert!(jump.posture(alpha.as_slice(), 1.0).0[2].angle_to(&cycle.joints[99][2]) < 1e-9);
+    }
+
+    #[test]
+    fn refuses_databases_that_are_no_database() {
+        let cycles = cycles();
+        assert_eq!(Model::build(Activity::Walking, true, &cycles[..1]).unwrap_err(), ModelError::TooFew(1));
+        let equal = [cycles[0].clone(), cycles[0].clone()];
+        assert_eq!(Model::build(Activity::Walking, true, &equal).unwrap_err(), ModelError::NoVariance);
+        assert!(matches!(Model::build(Activity::Running, true, &cycles), Err(ModelError::Activity { .. })));
+        let mut short = cycles;
+        short[1].joints.pop();
+        assert!(matches!(Model::build(Activity::Walking, true, &short), Err(ModelError::Samples { found: 99, .. })));
+    }
 }

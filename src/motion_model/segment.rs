@@ -2,7 +2,8 @@
 //!
 //! Gait. Heel strikes are the maxima of the heel's position ahead of the root along the local heading (Zeni et al. 2008,
 //! Gait & Posture 27(4)), which needs no floor and works on a treadmill, whose belt is added to the root's path first.
-//! A cycle runs from one right strike to the next. Its carrier follows the circular arc through the root's first and last
+//! A cycle runs from one right strike to the next; a clip that holds more strides between left strikes gives these, rotated
+//! so that phase 0 is the right strike within. The cycle's carrier follows the circular arc through the root's first and last
 //! position whose turn Δψ is the change of the root's yaw between two equal phases:
 //!   heading ψ(μ) = ψ0 + Δψ μ,   ψ0 = direction of the chord − Δψ/2,   arc length L = chord · (Δψ/2)/sin(Δψ/2)     (1)
 //! so a turning walk has the path speed L/T, and what is left of the root is periodic. The small difference that remains
@@ -20,6 +21,7 @@ use std::ops::Range;
 
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
+use super::cadence::CadenceLaw;
 use super::cycle::{Activity, Cycle, RootSample, SAMPLES};
 use crate::body::{BALL_JOINTS, Clip, Joint, Pose, place};
 use crate::math::rotation::{exp, log};
@@ -28,23 +30,29 @@ use crate::math::rotation::{exp, log};
 const HEEL: (f64, f64) = (-0.06, -0.07);
 /// A maximum counts when the signal rises and falls by this part of its range around it; less lets wiggles of a shaky
 /// recording in, more loses short strides beside long ones.
-const PEAK_DROP: f64 = 0.2;
+const PEAK_DROP: f64 = 0.1;
 /// A clip whose root is slower than this is a treadmill's, or a stand, m/s.
 const TRAVELS_M_S: f64 = 0.2;
-/// Largest difference of a leg joint between the two ends of a cycle: starting, stopping and stumbling strides differ by
-/// more, steady ones by 2 to 8 degrees.
-const MISMATCH_RAD: f64 = 0.35;
-/// Durations of a cycle, seconds; a missed strike doubles it.
+/// Largest r.m.s. difference of the leg joints between the two ends of a cycle. Recorded steady cycles stay below 6 degrees,
+/// first, last and turning ones lie at 12 to 20.
+const MISMATCH_RAD: f64 = 0.21;
+/// Durations of a cycle, seconds, and against the cadence law; a missed strike doubles it.
 const DURATION_S: Range<f64> = 0.4..3.0;
+const DURATION_OF_LAW: Range<f64> = 0.55..1.7;
 /// Normalised speeds V = v/H in 1/s at which people walk, and at which they run.
-const WALKING_V: Range<f64> = 0.2..2.8;
+const WALKING_V: Range<f64> = 0.35..2.8;
 const RUNNING_V: Range<f64> = 1.5..9.0;
+/// A stride that turns by more is a turn with its own steps, not walking in a bend.
+const TURN_RAD: f64 = 1.2;
 /// A flight lifts both ankles by this part of the hip height for at least [`FLIGHT_S`].
 const FLIGHT_RISE: f64 = 0.05;
 const FLIGHT_S: f64 = 0.1;
 /// Vertical speed of the root that counts as moving, m/s, and how long it must rest to have settled.
 const RESTS_M_S: f64 = 0.1;
 const SETTLED_S: f64 = 0.2;
+
+/// Speed over the floor, in hip heights per second, of somebody who stands; runs and hops in a row are faster.
+const STANDS_V: f64 = 0.6;
 
 /// What is known of a clip beforehand.
 #[derive(Clone, Debug)]
@@ -73,7 +81,7 @@ pub enum SegmentError {
     Short { frames: usize, seconds: f64, activity: &'static str },
     #[error("stands still ({speed_m_s:.2} m/s): if it is a treadmill's, give its speed as speed_m_s in subjects.csv")]
     Standing { speed_m_s: f64 },
-    #[error("shows {strikes} right heel strikes, two are needed for a cycle")]
+    #[error("shows no whole stride ({strikes} right heel strikes)")]
     NoStride { strikes: usize },
     #[error("never has both feet in the air for {FLIGHT_S} s, so it is no jump")]
     NoFlight,
@@ -81,7 +89,7 @@ pub enum SegmentError {
     HipHeight(f64),
 }
 
-/// Cuts `clip` into cycles (right heel strike to the next) or jumps. Stretches that are no steady cycle are listed, not
+/// Cuts `clip` into cycles (phase 0 is the right heel strike) or jumps. Stretches that are no steady cycle are listed, not
 /// returned.
 pub fn segment(clip: &Clip, label: &Label) -> Result<Segments, SegmentError> {
     if !(clip.hip_height_m > 0.0 && clip.hip_height_m.is_finite()) {
@@ -206,18 +214,37 @@ fn gait(mut track: Track, label: &Label) -> Result<Segments, SegmentError> {
         None if speed_m_s < TRAVELS_M_S => return Err(SegmentError::Standing { speed_m_s }),
         _ => {}
     }
-    let strikes = strikes(&track);
-    if strikes.len() < 2 {
-        return Err(SegmentError::NoStride { strikes: strikes.len() });
-    }
     let mut segments = Segments::default();
-    for pair in strikes.windows(2) {
-        match gait_cycle(&track, pair[0], pair[1], label) {
+    for stride in strides(&track)? {
+        match gait_cycle(&track, &stride, label) {
             Ok(cycle) => segments.cycles.push(cycle),
-            Err(reason) => segments.rejected.push(format!("{}: {reason}", track.place_name(label, pair[0], pair[1]))),
+            Err(reason) => segments.rejected.push(format!("{}: {reason}", track.place_name(label, stride.from, stride.to))),
         }
     }
     Ok(segments)
+}
+
+/// From one heel strike to the next of the same foot, in frames.
+struct Stride {
+    from: f64,
+    to: f64,
+    /// Where in it, 0 to 1, the right foot strikes.
+    right_strike: f64,
+}
+
+/// The strides between right strikes, or where the clip holds more of them those between left strikes.
+fn strides(track: &Track) -> Result<Vec<Stride>, SegmentError> {
+    let [right, left] = [0, 1].map(|side| strikes(track, side));
+    let of_right = right.windows(2).map(|w| Stride { from: w[0], to: w[1], right_strike: 0.0 });
+    let of_left = left.windows(2).filter_map(|w| {
+        let strike = right.iter().find(|&&r| r > w[0] && r < w[1])?;
+        Some(Stride { from: w[0], to: w[1], right_strike: (strike - w[0]) / (w[1] - w[0]) })
+    });
+    let (of_right, of_left): (Vec<Stride>, Vec<Stride>) = (of_right.collect(), of_left.collect());
+    match of_right.len().max(of_left.len()) {
+        0 => Err(SegmentError::NoStride { strikes: right.len() }),
+        most => Ok(if of_right.len() == most { of_right } else { of_left }),
+    }
 }
 
 /// Median speed of the root over half seconds, m/s.
@@ -230,15 +257,15 @@ fn travel_speed(track: &Track) -> f64 {
     speeds[speeds.len() / 2]
 }
 
-/// Right heel strikes in frames, with fractions.
-fn strikes(track: &Track) -> Vec<f64> {
+/// Heel strikes of the right (0) or left (1) foot in frames, with fractions.
+fn strikes(track: &Track, side: usize) -> Vec<f64> {
     let facings: Vec<Vector2<f64>> = track.poses.iter().map(facing).collect();
     let half = track.frames(0.5);
     let ahead: Vec<f64> = (0..facings.len())
         .map(|i| {
             let heading: Vector2<f64> = facings[i.saturating_sub(half)..(i + half + 1).min(facings.len())].iter().sum();
             let heading = heading.try_normalize(1e-9).unwrap_or(facings[i]);
-            heading.dot(&ground(&(track.heels[0][i] - track.poses[i].root)))
+            heading.dot(&ground(&(track.heels[side][i] - track.poses[i].root)))
         })
         .collect();
     maxima(&smooth(&ahead, 0.02 * track.fps))
@@ -267,12 +294,13 @@ fn maxima(x: &[f64]) -> Vec<f64> {
     let mut sorted = x.to_vec();
     sorted.sort_by(f64::total_cmp);
     let drop = PEAK_DROP * (sorted[sorted.len() * 95 / 100] - sorted[sorted.len() * 5 / 100]);
+    // A maximum in the first frames is one when the signal still rose to it.
     let (mut found, mut rising, mut best) = (Vec::new(), true, 0);
     for i in 0..x.len() {
         if rising && x[i] > x[best] || !rising && x[i] < x[best] {
             best = i;
         } else if (x[best] - x[i]).abs() > drop {
-            if rising && best > 0 && x[best] - x[0] > 0.1 * drop {
+            if rising && best > 1 {
                 found.push(best);
             }
             rising = !rising;
@@ -288,22 +316,34 @@ fn vertex(before: f64, at: f64, after: f64) -> f64 {
     if bend >= 0.0 { 0.0 } else { (0.5 * (before - after) / bend).clamp(-0.5, 0.5) }
 }
 
-fn gait_cycle(track: &Track, from: f64, to: f64, label: &Label) -> Result<Cycle, String> {
+fn gait_cycle(track: &Track, stride: &Stride, label: &Label) -> Result<Cycle, String> {
+    let &Stride { from, to, .. } = stride;
     let duration_s = (to - from) / track.fps;
     if !DURATION_S.contains(&duration_s) {
         return Err(format!("lasts {duration_s:.2} s, a heel strike is missing or false"));
     }
-    let poses: Vec<Pose> = (0..=SAMPLES).map(|k| track.pose_at(from + (to - from) * k as f64 / SAMPLES as f64)).collect();
-    let (joint, mismatch) = largest_leg_mismatch(&poses[0], &poses[SAMPLES]);
+    let ends = [from, to].map(|at| track.pose_at(at));
+    let mismatch = leg_mismatch(&ends[0], &ends[1]);
     if mismatch > MISMATCH_RAD {
-        return Err(format!("not a steady cycle: {} differs by {:.0} degrees between its ends", joint.name(), mismatch.to_degrees()));
+        return Err(format!("not a steady cycle: the legs differ by {:.0} degrees between its ends", mismatch.to_degrees()));
     }
-    let arc = Arc::through(&poses[0], &poses[SAMPLES]);
+    let arc = Arc::through(&ends[0], &ends[1]);
+    if arc.turn.abs() > TURN_RAD {
+        return Err(format!("turns by {:.0} degrees", arc.turn.to_degrees().abs()));
+    }
     let speed_m_s = arc.length_m / duration_s;
     let (name, range) = if label.activity == Activity::Walking { ("walking", WALKING_V) } else { ("running", RUNNING_V) };
     if !range.contains(&(speed_m_s / track.hip_height_m)) {
         return Err(format!("{speed_m_s:.2} m/s is not {name} for a hip height of {:.2} m", track.hip_height_m));
     }
+    let law = CadenceLaw::prior(label.activity).frequency_hz(speed_m_s, track.hip_height_m);
+    if !DURATION_OF_LAW.contains(&(duration_s * law)) {
+        return Err(format!("lasts {duration_s:.2} s at {speed_m_s:.2} m/s, a heel strike is missing or false"));
+    }
+    let samples: Vec<(f64, Pose)> = (0..SAMPLES)
+        .map(|k| (k as f64 / SAMPLES as f64 + stride.right_strike).fract())
+        .map(|mu| (mu, track.pose_at(from + (to - from) * mu)))
+        .collect();
     let floor_m = track.floor_m(from.round() as usize..(to.round() as usize + 1).min(track.poses.len()));
     Ok(Cycle {
         subject: label.subject.clone(),
@@ -312,28 +352,22 @@ fn gait_cycle(track: &Track, from: f64, to: f64, label: &Label) -> Result<Cycle,
         parameter: label.parameter.unwrap_or(speed_m_s),
         hip_height_m: track.hip_height_m,
         duration_s,
-        joints: closed_joints(&poses),
-        root: periodic_root(&poses, &arc, floor_m, track.hip_height_m),
+        joints: closed_joints(&ends, &samples),
+        root: periodic_root(&ends, &samples, &arc, floor_m, track.hip_height_m),
     })
 }
 
-fn largest_leg_mismatch(first: &Pose, last: &Pose) -> (Joint, f64) {
+/// Root mean square angle between the leg joints of two postures.
+fn leg_mismatch(first: &Pose, last: &Pose) -> f64 {
     use Joint::*;
-    [LHip, LKnee, LAnkle, RHip, RKnee, RAnkle]
-        .map(|j| (j, first.joint(j).angle_to(last.joint(j))))
-        .into_iter()
-        .fold((LHip, 0.0), |most, next| if next.1 > most.1 { next } else { most })
+    let squares = [LHip, LKnee, LAnkle, RHip, RKnee, RAnkle].map(|j| first.joint(j).angle_to(last.joint(j)).powi(2));
+    (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
 }
 
-/// Equation (2) on the N samples of N + 1 poses.
-fn closed_joints(poses: &[Pose]) -> Vec<[UnitQuaternion<f64>; BALL_JOINTS]> {
-    let drift: [Vector3<f64>; BALL_JOINTS] = std::array::from_fn(|j| log(&(poses[0].joints[j].inverse() * poses[SAMPLES].joints[j])));
-    (0..SAMPLES)
-        .map(|k| {
-            let part = 0.5 - k as f64 / SAMPLES as f64;
-            std::array::from_fn(|j| poses[k].joints[j] * exp(&(drift[j] * part)))
-        })
-        .collect()
+/// Equation (2): `samples` are phases of the stride and postures there.
+fn closed_joints(ends: &[Pose; 2], samples: &[(f64, Pose)]) -> Vec<[UnitQuaternion<f64>; BALL_JOINTS]> {
+    let drift: [Vector3<f64>; BALL_JOINTS] = std::array::from_fn(|j| log(&(ends[0].joints[j].inverse() * ends[1].joints[j])));
+    samples.iter().map(|(mu, pose)| std::array::from_fn(|j| pose.joints[j] * exp(&(drift[j] * (0.5 - mu))))).collect()
 }
 
 /// The carrier's path of equation (1) on the floor; vectors are (x, z).
@@ -367,24 +401,21 @@ fn sinc(x: f64) -> f64 {
 }
 
 /// Root against the arc, closed like the joints; sway and progress have mean zero.
-fn periodic_root(poses: &[Pose], arc: &Arc, floor_m: f64, hip_height_m: f64) -> Vec<RootSample> {
-    let in_carrier: Vec<(UnitQuaternion<f64>, Vector3<f64>)> = poses
+fn periodic_root(ends: &[Pose; 2], samples: &[(f64, Pose)], arc: &Arc, floor_m: f64, hip_height_m: f64) -> Vec<RootSample> {
+    let in_carrier = |mu: f64, pose: &Pose| {
+        let on_floor = arc.position(mu);
+        let carrier = Vector3::new(on_floor.x, floor_m + hip_height_m, on_floor.y);
+        let carrier_from_world = exp(&Vector3::new(0.0, -arc.heading(mu), 0.0));
+        (carrier_from_world * pose.world_from_root, carrier_from_world * (pose.root - carrier) / hip_height_m)
+    };
+    let [first, last] = [in_carrier(0.0, &ends[0]), in_carrier(1.0, &ends[1])];
+    let drift = log(&(first.0.inverse() * last.0));
+    let rise = last.1 - first.1;
+    let mut samples: Vec<RootSample> = samples
         .iter()
-        .enumerate()
-        .map(|(k, pose)| {
-            let phase = k as f64 / SAMPLES as f64;
-            let on_floor = arc.position(phase);
-            let carrier = Vector3::new(on_floor.x, floor_m + hip_height_m, on_floor.y);
-            let carrier_from_world = exp(&Vector3::new(0.0, -arc.heading(phase), 0.0));
-            (carrier_from_world * pose.world_from_root, carrier_from_world * (pose.root - carrier) / hip_height_m)
-        })
-        .collect();
-    let drift = log(&(in_carrier[0].0.inverse() * in_carrier[SAMPLES].0));
-    let rise = in_carrier[SAMPLES].1 - in_carrier[0].1;
-    let mut samples: Vec<RootSample> = (0..SAMPLES)
-        .map(|k| {
-            let part = 0.5 - k as f64 / SAMPLES as f64;
-            let (rotation, position) = &in_carrier[k];
+        .map(|(mu, pose)| {
+            let (rotation, position) = in_carrier(*mu, pose);
+            let part = 0.5 - mu;
             RootSample { rotation: log(&(rotation * exp(&(drift * part)))), position: position + rise * part }
         })
         .collect();
@@ -417,10 +448,22 @@ fn jumps(track: &Track, label: &Label) -> Result<Segments, SegmentError> {
             segments.rejected.push(format!("{place}: begins before the jump before it has settled"));
             continue;
         }
+        let moving = [events.start, events.end].map(|i| horizontal_speed(track, i)).into_iter().fold(0.0, f64::max);
+        if moving > STANDS_V * track.hip_height_m {
+            segments.rejected.push(format!("{place}: moves at {moving:.1} m/s at its ends, a jump begins and ends standing"));
+            continue;
+        }
         free_from = events.end;
         segments.cycles.push(jump(track, events, label));
     }
     Ok(segments)
+}
+
+/// Speed of the root over the floor around a frame, m/s.
+fn horizontal_speed(track: &Track, frame: usize) -> f64 {
+    let reach = track.frames(0.05).max(1);
+    let (a, b) = (frame.saturating_sub(reach), (frame + reach).min(track.poses.len() - 1));
+    ground(&(track.poses[b].root - track.poses[a].root)).norm() * track.fps / (b - a) as f64
 }
 
 /// Frames during which both ankles are up in the air.
@@ -492,5 +535,158 @@ fn jump(track: &Track, events: JumpEvents, label: &Label) -> Cycle {
                 position: carrier_from_world * (p.root - carrier) / h,
             })
             .collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::Shape;
+    use std::f64::consts::TAU;
+
+    const FPS: f64 = 100.0;
+    const H: f64 = 0.9;
+    const PERIOD_S: f64 = 1.13;
+    /// Time of the first right strike.
+    const STRIKE_S: f64 = 0.31;
+
+    /// Stiff legs that swing like pendulums: the heel is farthest ahead where the hip is most flexed.
+    fn walker(speed_m_s: f64, turn_per_s: f64, belt: bool) -> Clip {
+        let offsets = Shape::template(H / 0.53).offsets();
+        let mut on_floor = Vector2::new(3.0, -1.0);
+        let poses = (0..420).map(|i| {
+            let time_s = i as f64 / FPS;
+            let heading = 0.4 + turn_per_s * time_s;
+            let phase = (time_s - STRIKE_S) / PERIOD_S;
+            let mut pose = Pose::rest(Vector3::new(on_floor.x, 0.93 + 0.02 * (2.0 * TAU * phase).cos(), on_floor.y));
+            pose.world_from_root = exp(&Vector3::new(0.0, heading, 0.0)) * exp(&Vector3::new(0.05, 0.0, 0.04 * (TAU * phase).sin()));
+            pose.joints[Joint::RHip as usize - 1] = exp(&Vector3::new(-0.4 * (TAU * phase).cos(), 0.0, 0.0));
+            pose.joints[Joint::LHip as usize - 1] = exp(&Vector3::new(0.4 * (TAU * phase).cos(), 0.0, 0.0));
+            if !belt {
+                let middle = heading + turn_per_s / FPS / 2.0;
+                on_floor += Vector2::new(middle.sin(), middle.cos()) * (speed_m_s / FPS);
+            }
+            pose
+        });
+        Clip { fps: FPS, poses: poses.collect(), offsets, hip_height_m: H }
+    }
+
+    fn label(parameter: Option<f64>) -> Label {
+        Label { subject: "s".into(), source: "t".into(), activity: Activity::Walking, parameter, start_s: None, end_s: None }
+    }
+
+    #[test]
+    fn finds_known_strikes_speed_and_postures_straight_turning_and_on_a_belt() {
+        for (turn_per_s, belt) in [(0.0, false), (0.6, false), (0.0, true)] {
+            let found = segment(&walker(1.3, turn_per_s, belt), &label(belt.then_some(1.3))).unwrap();
+            assert_eq!(found.cycles.len(), 3, "{turn_per_s} {belt} {:?}", found.rejected);
+            for cycle in &found.cycles {
+                assert!((cycle.parameter - 1.3).abs() < 0.002, "{}", cycle.parameter);
+                assert!((cycle.duration_s - PERIOD_S).abs() < 0.006, "{}", cycle.duration_s);
+                for (k, (joints, root)) in cycle.joints.iter().zip(&cycle.root).enumerate() {
+                    let phase = k as f64 / SAMPLES as f64;
+                    let hip = log(&joints[Joint::RHip as usize - 1]);
+                    assert!((hip - Vector3::new(-0.4 * (TAU * phase).cos(), 0.0, 0.0)).norm() < 0.01);
+                    assert!((root.rotation - Vector3::new(0.05, 0.0, 0.04 * (TAU * phase).sin())).norm() < 0.005, "{root:?}");
+                    assert!(root.position.x.abs() < 0.003 && root.position.z.abs() < 0.003, "{root:?}");
+                }
+                let bob = cycle.root[0].position.y - cycle.root[25].position.y;
+                assert!((bob - 0.04 / H).abs() < 0.001, "{bob}");
+            }
+        }
+    }
+
+    #[test]
+    fn strikes_do_not_depend_on_where_the_clip_begins() {
+        let mut clip = walker(1.3, 0.0, false);
+        clip.poses.drain(..20);
+        let found = segment(&clip, &label(None)).unwrap();
+        let first = found.cycles[0].source.clone();
+        assert_eq!(first, format!("t {:.2}-{:.2} s", STRIKE_S - 0.2, STRIKE_S - 0.2 + PERIOD_S));
+        let part = Label { start_s: Some(1.0), end_s: Some(2.8), ..label(None) };
+        assert_eq!(segment(&walker(1.3, 0.0, false), &part).unwrap().cycles.len(), 1);
+    }
+
+    #[test]
+    fn strides_between_left_strikes_begin_at_the_right_strike_too() {
+        let mut clip = walker(1.3, 0.0, false);
+        // Right strikes at 0.31 and 1.44 s, left ones at 0.875 and 2.005 s: without the first right one, one left stride is left.
+        clip.poses = clip.poses[45..215].to_vec();
+        let found = segment(&clip, &label(None)).unwrap();
+        assert_eq!(found.cycles.len(), 1);
+        for (k, joints) in found.cycles[0].joints.iter().enumerate() {
+            let hip = log(&joints[Joint::RHip as usize - 1]).x;
+            assert!((hip + 0.4 * (TAU * k as f64 / SAMPLES as f64).cos()).abs() < 0.01, "{k}");
+        }
+    }
+
+    #[test]
+    fn closing_makes_the_ends_meet_half_way() {
+        let mut clip = walker(1.3, 0.0, false);
+        for (i, pose) in clip.poses.iter_mut().enumerate() {
+            pose.joints[Joint::RKnee as usize - 1] = exp(&Vector3::new(0.05 * i as f64 / FPS, 0.0, 0.0));
+        }
+        let cycle = &segment(&clip, &label(None)).unwrap().cycles[0];
+        let knee = |k: usize| log(&cycle.joints[k][Joint::RKnee as usize - 1]).x;
+        let middle = 0.05 * (STRIKE_S + PERIOD_S / 2.0);
+        (0..SAMPLES).for_each(|k| assert!((knee(k) - middle).abs() < 1e-3, "{k}"));
+    }
+
+    #[test]
+    fn unsteady_cycles_and_useless_clips_are_refused() {
+        let mut stumble = walker(1.3, 0.0, false);
+        stumble.poses[150..].iter_mut().for_each(|p| p.joints[Joint::LKnee as usize - 1] = exp(&Vector3::new(1.0, 0.0, 0.0)));
+        let found = segment(&stumble, &label(None)).unwrap();
+        assert_eq!((found.cycles.len(), found.rejected.len()), (2, 1));
+        assert!(found.rejected[0].contains("not a steady cycle"), "{:?}", found.rejected);
+        let run = segment(&walker(3.0, 0.0, false), &label(None)).unwrap();
+        assert!(run.cycles.is_empty() && run.rejected[0].contains("is not walking"), "{:?}", run.rejected);
+        assert!(matches!(segment(&walker(1.3, 0.0, true), &label(None)), Err(SegmentError::Standing { .. })));
+        let short = Clip { poses: walker(1.0, 0.0, false).poses[..20].to_vec(), ..walker(1.0, 0.0, false) };
+        assert!(matches!(segment(&short, &label(None)), Err(SegmentError::Short { frames: 20, .. })));
+        let mut still = jumper();
+        still.poses.truncate(50);
+        assert_eq!(segment(&still, &Label { activity: Activity::Jumping, ..label(None) }).unwrap_err(), SegmentError::NoFlight);
+    }
+
+    /// Stands, bends its knees for 0.4 s, flies 0.5 s over 0.9 m, bends them again and stands. Times of start, take-off,
+    /// landing and rest: 0.5, 0.9, 1.4, 2.0 s.
+    fn jumper() -> Clip {
+        let offsets = Shape::template(H / 0.53).offsets();
+        let leg = offsets[Joint::RKnee as usize].norm();
+        let poses = (0..300).map(|i| {
+            let t = i as f64 / FPS;
+            let crouch =
+                |from: f64, to: f64| if t > from && t < to { (std::f64::consts::PI * (t - from) / (to - from)).sin().powi(2) } else { 0.0 };
+            let bend = 0.8 * crouch(0.5, 0.9) + 0.8 * crouch(1.4, 2.0);
+            let flight = ((t - 0.9) / 0.5).clamp(0.0, 1.0);
+            let up = 0.5 * 9.81 * 0.25 * flight * (1.0 - flight);
+            let mut pose = Pose::rest(Vector3::new(0.9 * flight, 0.93 + up - 2.0 * leg * (1.0 - bend.cos()), 0.0));
+            pose.world_from_root = exp(&Vector3::new(0.0, std::f64::consts::FRAC_PI_2, 0.0));
+            for (hip, knee, ankle) in [(Joint::RHip, Joint::RKnee, Joint::RAnkle), (Joint::LHip, Joint::LKnee, Joint::LAnkle)] {
+                pose.joints[hip as usize - 1] = exp(&Vector3::new(-bend, 0.0, 0.0));
+                pose.joints[knee as usize - 1] = exp(&Vector3::new(2.0 * bend, 0.0, 0.0));
+                pose.joints[ankle as usize - 1] = exp(&Vector3::new(-bend, 0.0, 0.0));
+            }
+            pose
+        });
+        Clip { fps: FPS, poses: poses.collect(), offsets, hip_height_m: H }
+    }
+
+    #[test]
+    fn finds_a_jumps_events_and_length() {
+        let clip = jumper();
+        let track = Track::new(&clip, 0..clip.poses.len());
+        let events = key_events(&track, flights(&track)[0].clone());
+        for (found, known_s) in [(events.start, 0.5), (events.take_off, 0.9), (events.landing, 1.4), (events.end, 2.0)] {
+            assert!((found as f64 / FPS - known_s).abs() < 0.06, "{events:?}");
+        }
+        let jump = &segment(&clip, &Label { activity: Activity::Jumping, ..label(None) }).unwrap().cycles[0];
+        assert!((jump.parameter - 0.9).abs() < 1e-3, "{}", jump.parameter);
+        let (first, last) = (&jump.root[0], &jump.root[SAMPLES - 1]);
+        assert!(first.position.z.abs() < 1e-9 && (last.position.z * H - 0.9).abs() < 1e-3);
+        assert!(last.position.x.abs() < 1e-9 && last.rotation.norm() < 1e-9);
+        let rise = jump.root.iter().map(|s| s.position.y).fold(f64::MIN, f64::max) - first.position.y;
+        assert!((rise * H - 9.81 * 0.25 / 8.0).abs() < 0.01, "{rise}");
     }
 }

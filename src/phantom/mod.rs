@@ -1,1 +1,11 @@
 //! A known body and stage before a known rig, ray-cast to images: truth for tests and for the demo.
+
+pub mod figure;
+pub mod noise;
+pub mod scene;
+pub mod stage;
+pub mod staging;
+
+pub use figure::Figure;
+pub use scene::{DepthMap, Scene, View, depth, mask, render, render_stage, silhouette};
+pub use stage::Stage;

@@ -1,1 +1,40 @@
-//! Pictures people look at.
+//! Pictures people look at: overlays, depth maps, stick figures, clouds, curves.
+//!
+//! Left is blue and right is vermilion everywhere (Okabe and Ito's palette, which colour-blind readers tell apart), the
+//! middle of the body is neutral. Lengths have the same scale along both axes; axes carry their units.
+
+use std::path::{Path, PathBuf};
+
+use image::{ImageFormat, RgbImage};
+
+use crate::io::write_atomic;
+
+pub mod canvas;
+pub mod clouds;
+pub mod curves;
+pub mod figures;
+pub mod maps;
+pub mod overlay;
+
+pub use clouds::cloud_and_body;
+pub use curves::{Curve, curves};
+pub use figures::stick_figures;
+pub use maps::depth_map;
+pub use overlay::{overlay, strip};
+
+#[derive(Debug, thiserror::Error)]
+pub enum ReportError {
+    #[error("drawing failed: {0}")]
+    Draw(#[from] opencv::Error),
+    #[error("cannot encode {path}: {error}")]
+    Encode { path: PathBuf, error: image::ImageError },
+    #[error("cannot write {path}: {error}")]
+    Write { path: PathBuf, error: std::io::Error },
+}
+
+/// Writes a picture as PNG.
+pub fn save(path: &Path, picture: &RgbImage) -> Result<(), ReportError> {
+    let mut png = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut png, ImageFormat::Png).map_err(|error| ReportError::Encode { path: path.into(), error })?;
+    write_atomic(path, png.get_ref()).map_err(|error| ReportError::Write { path: path.into(), error })
+}

@@ -4,16 +4,24 @@
 //! bytes at every call. Everything made from it must be labelled synthetic.
 
 mod ground;
+mod jumping;
 mod posture;
+mod running;
+mod stride;
 mod variation;
 mod walking;
 
 use nalgebra::Vector3;
+use rand_chacha::ChaCha12Rng;
 use rayon::prelude::*;
 
+use self::jumping::Habit;
+use self::posture::Angles;
 use self::variation::{Style, add_cycle_noise, cycle_rng, normal, subject_rng, uniform};
-use super::cycle::{Activity, Cycle};
+use super::cycle::{Activity, Cycle, RootSample};
 use crate::body::{Joint, Length, NODES, Shape};
+
+pub(super) const GRAVITY: f64 = 9.81;
 
 /// One synthetic person with a way of doing one activity.
 #[derive(Clone, Debug)]
@@ -27,9 +35,9 @@ pub struct SyntheticSubject {
     style: Style,
     /// Own cadence over the population's.
     tempo: f64,
-    /// Distance between the tracks of the feet, and of a hip joint from the middle, in units of H.
+    /// Distance between the tracks of the feet in walking, in units of H.
     step_width: f64,
-    hip_breadth: f64,
+    habit: Habit,
     offsets: [Vector3<f64>; NODES],
 }
 
@@ -41,6 +49,7 @@ pub fn subject(activity: Activity, seed: u64) -> SyntheticSubject {
     let step_width = 0.12 * (1.0 + 0.3 * normal(&mut body)).clamp(0.3, 1.8);
     let mut rng = subject_rng(seed, Some(activity));
     let tempo = 1.0 + 0.04 * normal(&mut rng);
+    let habit = Habit::neutral();
     let shape = shape(stature_m, hip_height_m);
     SyntheticSubject {
         name: format!("synthetic_{seed}"),
@@ -49,9 +58,9 @@ pub fn subject(activity: Activity, seed: u64) -> SyntheticSubject {
         hip_height_m,
         seed,
         style: if seed == 0 { Style::neutral() } else { Style::draw(&mut rng) },
+        habit: if seed == 0 { habit } else { habit.varied(1.0, &mut rng) },
         tempo,
         step_width,
-        hip_breadth: Joint::LHip.rest_position().x * stature_m / hip_height_m,
         offsets: shape.offsets(),
     }
 }
@@ -87,24 +96,48 @@ impl SyntheticSubject {
 
     fn make(&self, parameter: f64, repeat: Option<u32>) -> Cycle {
         let mut rng = repeat.map(|r| cycle_rng(self.seed, self.activity, parameter, r));
-        let rv = parameter / self.hip_height_m;
-        let mut tracks = self.style.tracks(rv, walking::REFERENCE_RV, true, walking::population);
-        let mut cycle_s = 1.0 / (self.tempo * walking::frequency_hz(rv));
-        if let Some(rng) = &mut rng {
-            add_cycle_noise(&mut tracks, rng);
-            cycle_s *= 1.0 + 0.01 * normal(rng);
-        }
-        let (angles, root) = walking::cycle(self, &tracks, parameter, cycle_s);
+        let (angles, root, duration_s) = match self.activity {
+            Activity::Jumping => self.jump(parameter, rng.as_mut()),
+            _ => self.stride(parameter, rng.as_mut()),
+        };
         Cycle {
             subject: self.name.clone(),
             source: format!("synthetic, {}", repeat.map_or("mean cycle".into(), |r| format!("cycle {}", r + 1))),
             activity: self.activity,
             parameter,
             hip_height_m: self.hip_height_m,
-            duration_s: cycle_s,
+            duration_s,
             joints: angles.iter().map(|a| a.joints()).collect(),
             root,
         }
+    }
+
+    fn stride(&self, speed: f64, rng: Option<&mut ChaCha12Rng>) -> (Vec<Angles>, Vec<RootSample>, f64) {
+        let rv = speed / self.hip_height_m;
+        let running = self.activity == Activity::Running;
+        let (mut tracks, frequency_hz) = if running {
+            (self.style.tracks(rv, running::REFERENCE_RV, true, running::population), running::frequency_hz(rv))
+        } else {
+            (self.style.tracks(rv, walking::REFERENCE_RV, true, walking::population), walking::frequency_hz(rv))
+        };
+        let mut cycle_s = 1.0 / (self.tempo * frequency_hz);
+        if let Some(rng) = rng {
+            add_cycle_noise(&mut tracks, rng);
+            cycle_s *= 1.0 + 0.01 * normal(rng);
+        }
+        let gait = if running { running::gait(speed, rv, cycle_s) } else { walking::gait(speed, cycle_s) };
+        let (angles, root) = stride::cycle(self, &tracks, &gait);
+        (angles, root, cycle_s)
+    }
+
+    fn jump(&self, length: f64, rng: Option<&mut ChaCha12Rng>) -> (Vec<Angles>, Vec<RootSample>, f64) {
+        let mut tracks = self.style.tracks(length / self.hip_height_m, jumping::REFERENCE, false, jumping::population);
+        let mut habit = self.habit.clone();
+        if let Some(rng) = rng {
+            add_cycle_noise(&mut tracks, rng);
+            habit = habit.varied(0.25, rng);
+        }
+        jumping::jump(self, &tracks, &habit, length)
     }
 }
 

@@ -12,10 +12,12 @@ use crate::math::rotation::{exp, log};
 /// Share of the trunk's bending that each joint of the spine takes, from the pelvis up.
 const SPINE: [(Joint, f64); 5] = [(Joint::Vl5, 0.20), (Joint::Vl1, 0.25), (Joint::Vt10, 0.25), (Joint::Vt5, 0.20), (Joint::Vt1, 0.10)];
 /// Heel behind the ankle; heel, ball and toe tip of the sole under their joints: fractions of stature.
-const HEEL_BACK: f64 = 0.040;
+pub(super) const HEEL_BACK: f64 = 0.040;
 const ANKLE_HEIGHT: f64 = 0.039;
 const BALL_HEIGHT: f64 = 0.020;
 const TOE_FORWARD: f64 = 0.055;
+/// From the heel to the toe tip of a flat foot.
+pub(super) const FOOT_LENGTH: f64 = HEEL_BACK + 0.050 + TOE_FORWARD;
 /// Lowest points of a foot: heel, ball, toe tip.
 pub(super) const SOLE_POINTS: usize = 3;
 /// The sole points of both feet, left first, relative to the root, metres.
@@ -112,7 +114,8 @@ impl Angles {
     fn leg(&self, s: usize) -> [UnitQuaternion<f64>; 4] {
         let side = &self.sides[s];
         let sign = if s == 0 { 1.0 } else { -1.0 };
-        let hip = list(side.leg_lateral - self.list) * pitch(-side.hip_flexion) * yaw(-sign * side.hip_rotation - self.yaw);
+        let carrier_from_thigh = list(side.leg_lateral) * pitch(self.tilt - side.hip_flexion) * yaw(-sign * side.hip_rotation);
+        let hip = self.carrier_from_root().inverse() * carrier_from_thigh;
         let ankle = list(-side.leg_lateral) * yaw(sign * side.toe_out) * pitch(-side.ankle);
         [hip, pitch(side.knee), ankle, pitch(-side.toe)]
     }
@@ -140,6 +143,26 @@ impl Angles {
         }
         (soles, pitches)
     }
+}
+
+/// Where the sole of a foot with its ankle at the origin is, metres.
+pub(super) struct SoleAtOrigin {
+    pub lowest: f64,
+    pub heel_z: f64,
+    pub toe_z: f64,
+}
+
+/// Sole of a foot at `foot_pitch` (toes up positive) with the toes bent up by `toe`.
+pub(super) fn sole_at_origin(foot_pitch: f64, toe: f64, stature_m: f64) -> SoleAtOrigin {
+    let rotation = pitch(-foot_pitch);
+    let ball_joint = rotation * (Joint::LMidtarsal.rest_position() - Joint::LAnkle.rest_position());
+    let [heel, ball, tip] = [
+        rotation * Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK),
+        ball_joint + rotation * Vector3::new(0.0, -BALL_HEIGHT, 0.0),
+        ball_joint + rotation * pitch(-toe) * Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD),
+    ]
+    .map(|p| p * stature_m);
+    SoleAtOrigin { lowest: heel.y.min(ball.y).min(tip.y), heel_z: heel.z, toe_z: tip.z }
 }
 
 struct SideJoints {

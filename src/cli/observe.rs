@@ -1,0 +1,74 @@
+//! A session's frames to what the fit looks at: clouds and silhouettes.
+
+use anyhow::{Context, Result, bail};
+use image::GrayImage;
+use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
+use muybridge::fit::Observation;
+use muybridge::footage::{FrameSet, foreground};
+use muybridge::io::session::Session;
+use rayon::prelude::*;
+
+use super::progress;
+
+/// Frames whose median over time stands in for missing pictures of the empty stage.
+const STAGE_FRAMES: usize = 25;
+/// Frames that are in memory at once.
+const BATCH: usize = 8;
+
+/// Empty-stage pictures of a session, per camera: its own, or the median over time.
+pub fn stage_pictures(session: &Session) -> Result<Vec<GrayImage>> {
+    if let Some(pictures) = &session.backgrounds {
+        return Ok(pictures.clone());
+    }
+    eprintln!(
+        "note: no pictures of the empty stage (NAME_background.png); the median over time stands in, which needs a person who moves on"
+    );
+    let step = session.frame_count.div_ceil(STAGE_FRAMES).max(1);
+    let mut per_camera: Vec<Vec<GrayImage>> = vec![Vec::new(); session.rig.cameras.len()];
+    for frame in session.frames().step_by(step) {
+        for (pictures, image) in per_camera.iter_mut().zip(frame?.images) {
+            pictures.push(image);
+        }
+    }
+    let medians = per_camera.iter().map(|pictures| foreground::stage_from_frames(pictures));
+    medians.collect::<Option<_>>().context("the session has no frames to take the empty stage from")
+}
+
+/// Clouds of all frames; `each` sees every frame with its pictures, in order.
+pub fn observe(
+    session: &Session,
+    rig: &CloudRig,
+    options: &CloudOptions,
+    mut each: impl FnMut(&FrameSet, &FrameCloud) -> Result<()>,
+) -> Result<Vec<Observation>> {
+    let bar = progress::bar("clouds", session.frame_count as u64);
+    let mut observations = Vec::with_capacity(session.frame_count);
+    let mut frames = session.frames();
+    loop {
+        let batch: Vec<FrameSet> = frames.by_ref().take(BATCH).collect::<Result<_, _>>()?;
+        if batch.is_empty() {
+            break;
+        }
+        let clouds: Vec<FrameCloud> = batch
+            .par_iter()
+            .map(|frame| {
+                let cloud = rig.frame(&frame.images, options).with_context(|| format!("frame {}", frame.number));
+                bar.inc(1);
+                cloud
+            })
+            .collect::<Result<_>>()?;
+        for (frame, cloud) in batch.iter().zip(clouds) {
+            each(frame, &cloud)?;
+            observations.push(Observation { number: frame.number, time_s: frame.time_s, cloud: cloud.cloud, masks: cloud.masks });
+        }
+    }
+    bar.finish();
+    if observations.iter().all(|o| o.cloud.points.is_empty()) {
+        bail!(
+            "{}: nobody is in view in any of the {} frames; check that the pictures show a person that the stage pictures do not",
+            session.folder.display(),
+            session.frame_count
+        );
+    }
+    Ok(observations)
+}

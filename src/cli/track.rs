@@ -1,0 +1,211 @@
+//! `muybridge track`: a session's footage to the person's motion, style and size.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use clap::Args;
+use image::GrayImage;
+use muybridge::body::{Clip, NODES, Placement, Pose, place};
+use muybridge::clouds::{CloudOptions, CloudRig};
+use muybridge::fit::{self, Fit, FitOptions, Observation};
+use muybridge::io::{bvh, fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::motion_model::{Activity, Model, synthetic};
+use muybridge::phantom;
+use muybridge::report;
+use muybridge::rig::{Rig, Up};
+use muybridge::style::Style;
+use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
+
+use super::motions::ActivityName;
+use super::observe;
+
+/// Frames in the strip of overlays.
+const STRIP: usize = 6;
+
+#[derive(Args)]
+pub struct TrackArgs {
+    /// Session folder with Calib.toml and one folder or video per camera
+    session: PathBuf,
+    /// Motion model (.npz) of `muybridge model build`; the embedded synthetic one without it
+    #[arg(long)]
+    model: Option<PathBuf>,
+    /// Which embedded model to use
+    #[arg(long, default_value = "walking", conflicts_with = "model")]
+    activity: ActivityName,
+    /// Folder for style.json, joints.csv, motion.bvh, fit.json
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Frames per second of pictures
+    #[arg(long)]
+    fps: Option<f64>,
+    /// Part of the model's variance that the last stage of the fit uses; 20 components without it
+    #[arg(long, value_parser = super::part)]
+    variance: Option<f64>,
+    /// Also draw the result into DIR/pictures
+    #[arg(long)]
+    pictures: bool,
+}
+
+/// A model with what the outputs say of it.
+pub struct NamedModel {
+    pub model: Model,
+    pub name: String,
+    pub hash: String,
+}
+
+impl NamedModel {
+    pub fn new(model: Model, name: String) -> NamedModel {
+        let hash = model_npz::model_hash(&model);
+        NamedModel { model, name, hash }
+    }
+
+    /// The embedded synthetic database's.
+    pub fn synthetic(activity: Activity) -> Result<NamedModel> {
+        let model = Model::build(activity, true, &synthetic::database(activity))?;
+        Ok(NamedModel::new(model, format!("embedded synthetic {activity} model")))
+    }
+}
+
+/// A fit with the session it belongs to.
+pub struct Tracked {
+    pub fit: Fit,
+    pub observations: Vec<Observation>,
+    /// One picture of the reference camera for each frame of the strip: index of the frame, picture.
+    pub pictures: Vec<(usize, GrayImage)>,
+}
+
+pub fn run(args: &TrackArgs) -> Result<()> {
+    let model = match &args.model {
+        Some(path) => NamedModel::new(model_npz::read_model(path)?, path.display().to_string()),
+        None => NamedModel::synthetic(args.activity.into())?,
+    };
+    if model.model.synthetic {
+        eprintln!(
+            "note: the model is synthetic; for figures that mean something build one from motion capture with `muybridge model build`"
+        );
+    }
+    let (session, notices) = Session::open(&args.session, args.fps)?;
+    notices.iter().for_each(|notice| eprintln!("note: {notice}"));
+    let mut options = FitOptions::default();
+    if let Some(variance) = args.variance {
+        options.components = model.model.components(variance);
+    }
+    let tracked = track(&session, &model, &options)?;
+    write(&args.output, &session, &model, &tracked)?;
+    if args.pictures {
+        draw(&args.output.join("pictures"), &session.rig, &tracked)?;
+    }
+    summary(&args.output, &tracked.fit);
+    Ok(())
+}
+
+/// Clouds of a session and the fit to them.
+pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
+    let cloud_options = CloudOptions::default();
+    let stage = observe::stage_pictures(session)?;
+    let rig =
+        CloudRig::new(&session.rig, Some(&stage), &cloud_options).with_context(|| format!("the rig of {}", session.folder.display()))?;
+    let step = session.frame_count.div_ceil(STRIP).max(1);
+    let (mut pictures, mut index) = (Vec::new(), 0);
+    let observations = observe::observe(session, &rig, &cloud_options, |frame, _| {
+        if index % step == 0 {
+            pictures.extend(frame.images.first().map(|image| (index, image.clone())));
+        }
+        index += 1;
+        Ok(())
+    })?;
+    let bar = super::progress::bar("fit", 100);
+    let done = std::cell::Cell::new(0);
+    let fit = fit::fit(&observations, &session.rig, &model.model, options, &|_, share| {
+        let percent = (100.0 * share) as u64;
+        bar.inc(percent.saturating_sub(done.replace(percent)));
+    })
+    .with_context(|| session.folder.display().to_string())?;
+    bar.finish();
+    Ok(Tracked { fit, observations, pictures })
+}
+
+/// Writes the four files of a tracked session.
+pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
+    let Tracked { fit, observations, .. } = tracked;
+    let placements = placements(fit);
+    let frames: Vec<(usize, f64)> = observations.iter().map(|o| (o.number, o.time_s)).collect();
+    let positions: Vec<[Vector3<f64>; NODES]> = placements.iter().map(|p| p.positions).collect();
+    joints_csv::write(&folder.join("joints.csv"), &frames, &positions)?;
+    let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
+    bvh::write_clip(&folder.join("motion.bvh"), &clip, Some(&clip_from_rig))?;
+    style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
+    let report = folder.join("fit.json");
+    fit_json::write(&report, fit, observations, &model.name, &model.hash).with_context(|| report.display().to_string())
+}
+
+fn placements(fit: &Fit) -> Vec<Placement> {
+    let offsets = fit.shape().offsets();
+    fit.poses.iter().map(|pose| place(&offsets, pose)).collect()
+}
+
+/// The person's style with its covariance.
+pub fn style(fit: &Fit, model: &NamedModel) -> Style {
+    let weights = DVector::from_column_slice(&fit.state.weights);
+    let hip_height = fit.shape().hip_height_m();
+    let rows = 0..weights.len();
+    let covariance = rows.clone().map(|i| rows.clone().map(|j| fit.shared_covariance[(i, j)]).collect()).collect();
+    let style = Style::of_weights(&model.model, &model.hash, &weights, fit.parameter(model.model.activity), hip_height, fit.cadence_hz);
+    Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }
+}
+
+/// The fitted poses in a y-up world, one per 1/fps second, dropped frames filled in; and the rotation into that world.
+fn clip(fit: &Fit, rig: &Rig, observations: &[Observation], fps: f64) -> Result<(Clip, Rotation3<f64>)> {
+    ensure!(!fit.poses.is_empty(), "the fit has no frames");
+    let clip_from_rig = match rig.up {
+        Up::Y => Rotation3::identity(),
+        Up::Z => Rotation3::new(Vector3::x() * -std::f64::consts::FRAC_PI_2),
+    };
+    let turn = UnitQuaternion::from_rotation_matrix(&clip_from_rig);
+    let turned = |pose: &Pose| Pose { root: turn * pose.root, world_from_root: turn * pose.world_from_root, ..pose.clone() };
+    let mut poses = vec![turned(&fit.poses[0])];
+    for (pair, numbers) in fit.poses.windows(2).zip(observations.windows(2)) {
+        let gap = (numbers[1].number - numbers[0].number).max(1);
+        poses.extend((1..=gap).map(|k| turned(&pair[0].towards(&pair[1], k as f64 / gap as f64))));
+    }
+    let shape = fit.shape();
+    Ok((Clip { fps, poses, offsets: shape.offsets(), hip_height_m: shape.hip_height_m() }, clip_from_rig))
+}
+
+/// Overlays, and the cloud with the body of the middle frame.
+pub fn draw(folder: &Path, rig: &Rig, tracked: &Tracked) -> Result<()> {
+    let Some(camera) = rig.cameras.first() else { return Ok(()) };
+    let placements = placements(&tracked.fit);
+    let (surface, offsets) = (muybridge::body::Surface::new(tracked.fit.shape()), tracked.fit.shape().offsets());
+    let mut tiles = Vec::new();
+    for (index, picture) in &tracked.pictures {
+        let placement = &placements[*index];
+        let outline = phantom::silhouette(&surface, &offsets, placement, camera);
+        let o = &tracked.observations[*index];
+        tiles.push((
+            report::overlay(picture, camera, &placement.positions, Some(&outline))?,
+            format!("frame {}, {:.2} s", o.number, o.time_s),
+        ));
+    }
+    report::save(&folder.join("overlay.png"), &report::strip(&tiles, 3, 640)?)?;
+    let middle = placements.len() / 2;
+    let points: Vec<Vector3<f64>> = tracked.observations[middle].cloud.points.iter().map(|p| p.position).collect();
+    let title = format!("Cloud and body, frame {}", tracked.observations[middle].number);
+    report::save(&folder.join("cloud.png"), &report::cloud_and_body(&points, &placements[middle].positions, rig.up, &title)?)?;
+    Ok(())
+}
+
+fn summary(folder: &Path, fit: &Fit) {
+    let shape = fit.shape();
+    let observed = fit.weight_uncertainty().iter().filter(|u| **u < 0.5).count();
+    println!(
+        "{} frames at {:.2} m/s and {:.2} cycles/s, stature {:.2} m, {:.1} mm from the points; {observed} of {} weights known to half the population's spread; in {}",
+        fit.poses.len(),
+        fit.speed_m_s,
+        fit.cadence_hz,
+        shape.stature_m,
+        1e3 * fit.rms_m(),
+        fit.state.weights.len(),
+        folder.display()
+    );
+}

@@ -1,0 +1,344 @@
+//! One frame: the pictures in, the person's point cloud and silhouettes out.
+
+use super::cloud::Cloud;
+use super::correlate::Region;
+use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
+use super::stereo::{PreparedView, StereoOptions, ViewDisparity, match_views};
+use super::{tidy, triangulate};
+use crate::rig::Rig;
+use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
+use image::{GrayImage, ImageBuffer, Luma};
+
+/// Room around what changed, px: the reach of the correlation windows and of the outline's blur.
+const MARGIN_PX: usize = 12;
+
+/// How clouds are made.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CloudOptions {
+    /// Nothing nearer is looked for, metres from the cameras.
+    pub nearest_m: f64,
+    /// Nothing farther is kept, metres.
+    pub farthest_m: f64,
+    /// Keep one point per cube of this side, metres; all points without it.
+    pub voxel_m: Option<f64>,
+    pub stereo: StereoOptions,
+    pub stage: StageOptions,
+}
+
+impl Default for CloudOptions {
+    fn default() -> Self {
+        // The stage test removes what a low bar for uniqueness lets in; bare skin needs the low bar.
+        let stereo = StereoOptions { uniqueness: 0.1, ..StereoOptions::default() };
+        Self { nearest_m: 1.2, farthest_m: 12.0, voxel_m: None, stereo, stage: StageOptions::default() }
+    }
+}
+
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum CloudError {
+    #[error(transparent)]
+    Rectify(#[from] RectifyError),
+    #[error("the rig has camera number {camera} but only {given} pictures were given; give one per camera")]
+    Images { camera: usize, given: usize },
+    #[error("a picture of {camera} is {found:?} pixels, the calibration says {expected:?}; use pictures of the calibrated size")]
+    Size { camera: String, found: [u32; 2], expected: [u32; 2] },
+    #[error("depths from {0} m to {1} m cannot be searched; the nearest must be positive and below the farthest")]
+    Depths(f64, f64),
+    #[error("the stage was made for {0} views, the rig group has {1}; make it again with this rectification")]
+    Stage(usize, usize),
+}
+
+/// What one frame gives.
+#[derive(Clone, Debug)]
+pub struct FrameCloud {
+    /// The person's points in the rig's world; empty when nobody is in view.
+    pub cloud: Cloud,
+    /// The person in each rig camera's raw picture, 0/255; `None` for cameras outside the group, and for all without a stage.
+    pub masks: Vec<Option<GrayImage>>,
+    /// The person's disparities in the reference view, px; NaN elsewhere.
+    pub disparity: Plane,
+}
+
+/// A rig made ready for footage: its rectified groups, and the empty stage as each of them sees it.
+#[derive(Clone, Debug)]
+pub struct CloudRig {
+    pub groups: Vec<(Rectification, Option<Stage>)>,
+}
+
+impl CloudRig {
+    /// `stage_images` has one picture of the empty stage per camera of the rig.
+    pub fn new(rig: &Rig, stage_images: Option<&[GrayImage]>, options: &CloudOptions) -> Result<Self, CloudError> {
+        let with_stage = |group: Rectification| {
+            let stage = stage_images.map(|images| Stage::new(&group, images, options)).transpose()?;
+            Ok((group, stage))
+        };
+        Ok(Self { groups: groups(rig)?.into_iter().map(with_stage).collect::<Result<_, CloudError>>()? })
+    }
+
+    /// The clouds of all groups together; masks and disparities are those of the first group that has them.
+    pub fn frame(&self, images: &[GrayImage], options: &CloudOptions) -> Result<FrameCloud, CloudError> {
+        let one = |(group, stage): &(Rectification, Option<Stage>)| frame_cloud(group, images, stage.as_ref(), options);
+        let mut frames = self.groups.iter().map(one).collect::<Result<Vec<_>, _>>()?.into_iter();
+        let mut all = frames.next().ok_or(RectifyError::Count(images.len()))?;
+        for frame in frames {
+            all.cloud.points.extend(frame.cloud.points);
+            for (mine, other) in all.masks.iter_mut().zip(frame.masks) {
+                *mine = mine.take().or(other);
+            }
+        }
+        Ok(all)
+    }
+}
+
+impl Stage {
+    /// The empty stage from one picture per camera of the rig.
+    pub fn new(rectification: &Rectification, images: &[GrayImage], options: &CloudOptions) -> Result<Self, CloudError> {
+        let images = pick(rectification, images)?;
+        Ok(Self::measure(rectification, &images, range(rectification, options)?[1], &options.stereo))
+    }
+}
+
+/// The person's cloud and silhouettes in one frame. `images` has one picture per camera of the rig. Without a stage every
+/// match between the nearest and farthest depth is kept and there are no masks.
+pub fn frame_cloud(
+    rectification: &Rectification,
+    images: &[GrayImage],
+    stage: Option<&Stage>,
+    options: &CloudOptions,
+) -> Result<FrameCloud, CloudError> {
+    let pictures = pick(rectification, images)?;
+    let range = range(rectification, options)?;
+    let planes: Vec<Plane> = pictures.iter().enumerate().map(|(k, picture)| rectification.warp(k, picture)).collect();
+    match stage {
+        None => everything(rectification, images.len(), planes, range, options),
+        Some(stage) if stage.views.len() == planes.len() => Ok(person(rectification, images.len(), planes, stage, range, options)),
+        Some(stage) => Err(CloudError::Stage(stage.views.len(), planes.len())),
+    }
+}
+
+fn everything(
+    rectification: &Rectification,
+    cameras: usize,
+    planes: Vec<Plane>,
+    range: [usize; 2],
+    options: &CloudOptions,
+) -> Result<FrameCloud, CloudError> {
+    let regions = vec![whole(rectification); planes.len()];
+    let found = search(rectification, planes, &regions, range, options);
+    let disparity = found[0].1.disparity.clone();
+    Ok(FrameCloud { cloud: points(rectification, &found[0], &disparity, options), masks: vec![None; cameras], disparity })
+}
+
+fn person(
+    rectification: &Rectification,
+    cameras: usize,
+    planes: Vec<Plane>,
+    stage: &Stage,
+    range: [usize; 2],
+    options: &CloudOptions,
+) -> FrameCloud {
+    let changes: Vec<Change> = planes.iter().zip(&stage.views).map(|(now, stage)| compare(now, &stage.plane, &options.stage)).collect();
+    let regions: Option<Vec<Region>> = changes.iter().map(|c| changed_box(&c.changed, &options.stage, MARGIN_PX)).collect();
+    let Some(regions) = regions else { return nobody(rectification, cameras) };
+    let found = search(rectification, planes, &regions, range, options);
+    let outline = |k: usize| person_mask(rectification, k, &changes, &stage.views[k], &found[k].1, &options.stage);
+    let persons: Vec<GrayImage> = (0..found.len()).map(outline).collect();
+    let disparity = inside(&found[0].1.disparity, &persons[0]);
+    let mut masks = vec![None; cameras];
+    for (k, view) in rectification.views.iter().enumerate() {
+        masks[view.index] = Some(rectification.unwarp(k, &persons[k]));
+    }
+    FrameCloud { cloud: points(rectification, &found[0], &disparity, options), masks, disparity }
+}
+
+fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Vec<&'a GrayImage>, CloudError> {
+    let picture = |view: &RectifiedView| {
+        let image = images.get(view.index).ok_or(CloudError::Images { camera: view.index, given: images.len() })?;
+        let (found, expected) = ([image.width(), image.height()], view.camera.size_px);
+        if found == expected { Ok(image) } else { Err(CloudError::Size { camera: view.camera.name.clone(), found, expected }) }
+    };
+    rectification.views.iter().map(picture).collect()
+}
+
+/// Whole disparities between the farthest and the nearest depth.
+fn range(rectification: &Rectification, options: &CloudOptions) -> Result<[usize; 2], CloudError> {
+    let (near, far) = (options.nearest_m, options.farthest_m);
+    if !(near > 0.0 && near < far && far.is_finite()) {
+        return Err(CloudError::Depths(near, far));
+    }
+    let widest = f64::from(rectification.size_px[0].max(rectification.size_px[1]));
+    Ok([rectification.disparity(far).floor(), rectification.disparity(near).ceil()].map(|d| d.min(widest) as usize))
+}
+
+fn search(
+    rectification: &Rectification,
+    planes: Vec<Plane>,
+    regions: &[Region],
+    range: [usize; 2],
+    options: &CloudOptions,
+) -> Vec<(PreparedView, ViewDisparity)> {
+    let prepared: Vec<PreparedView> = planes.into_iter().zip(&rectification.views).map(|(p, v)| PreparedView::new(p, v.step)).collect();
+    let found = match_views(&prepared, regions, range, &options.stereo);
+    prepared.into_iter().zip(found).collect()
+}
+
+fn inside(disparity: &Plane, mask: &GrayImage) -> Plane {
+    let values = disparity.iter().zip(mask.iter()).map(|(&d, &m)| if m == 0 { f32::NAN } else { d }).collect();
+    ImageBuffer::from_raw(disparity.width(), disparity.height(), values).expect("same size")
+}
+
+fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
+    let mut masks = vec![None; cameras];
+    for view in &rectification.views {
+        let [width, height] = view.camera.size_px;
+        masks[view.index] = Some(GrayImage::new(width, height));
+    }
+    let [width, height] = rectification.size_px;
+    FrameCloud { cloud: Cloud::default(), masks, disparity: Plane::from_pixel(width, height, Luma([f32::NAN])) }
+}
+
+fn points(rectification: &Rectification, reference: &(PreparedView, ViewDisparity), disparity: &Plane, options: &CloudOptions) -> Cloud {
+    let (prepared, found) = reference;
+    let all_views = rectification.views.len() as f32 - 1.0;
+    let (width, region) = (disparity.width() as usize, found.matches.region);
+    let mut confidence = Plane::new(disparity.width(), disparity.height());
+    for (j, (cost, rival)) in found.matches.cost.iter().zip(&found.matches.rival).enumerate() {
+        let i = (region.y[0] + j / region.width()) * width + region.x[0] + j % region.width();
+        let distinct = 1.0 - f32::from(cost[1]) / f32::from((*rival).max(1));
+        confidence.as_mut()[i] = distinct.clamp(0.0, 1.0) * found.confirmed[i].count_ones() as f32 / all_views;
+    }
+    let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, disparity, &confidence, &prepared.plane));
+    match options.voxel_m {
+        Some(side) => tidy::thin(cloud, side),
+        None => cloud,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::{Path, PathBuf};
+
+    fn footage(name: &str) -> Option<PathBuf> {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/footage").join(name);
+        if !folder.exists() {
+            println!("skipped: {} is not there", folder.display());
+        }
+        folder.exists().then_some(folder)
+    }
+
+    fn grey(path: PathBuf) -> GrayImage {
+        image::open(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display())).into_luma8()
+    }
+
+    fn pictures(folder: &Path, frame: usize) -> Vec<GrayImage> {
+        (0..3).map(|k| grey(folder.join(format!("cam_0{k}/{frame:06}.jpg")))).collect()
+    }
+
+    /// A rig of the session with its empty stage; OpenCV parses nothing here, the numbers come from the session's own file.
+    fn ready(folder: &Path, options: &CloudOptions) -> (Rig, CloudRig) {
+        let text = std::fs::read_to_string(folder.join("Calib.toml")).unwrap();
+        let table: toml::Table = text.parse().unwrap();
+        let numbers = |v: &toml::Value| -> Vec<f64> { v.as_array().unwrap().iter().map(|x| x.as_float().unwrap()).collect() };
+        let camera = |k: usize| {
+            let t = table[&format!("cam_0{k}")].as_table().unwrap();
+            let rows: Vec<f64> = t["matrix"].as_array().unwrap().iter().flat_map(numbers).collect();
+            let d = numbers(&t["distortions"]);
+            crate::rig::Camera {
+                name: format!("cam_0{k}"),
+                size_px: [640, 480],
+                matrix: nalgebra::Matrix3::from_row_slice(&rows),
+                distortion: [d[0], d[1], d[2], d[3], 0.0],
+                camera_from_world: nalgebra::Rotation3::new(nalgebra::Vector3::from_column_slice(&numbers(&t["rotation"]))),
+                translation: nalgebra::Vector3::from_column_slice(&numbers(&t["translation"])),
+            }
+        };
+        let rig = Rig { cameras: (0..3).map(camera).collect(), up: crate::rig::Up::Z };
+        let stage: Vec<GrayImage> = (0..3).map(|k| grey(folder.join(format!("cam_0{k}_background.png")))).collect();
+        let ready = CloudRig::new(&rig, Some(&stage), options).unwrap();
+        (rig, ready)
+    }
+
+    fn median(mut values: Vec<f64>) -> f64 {
+        let middle = values.len() / 2;
+        *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    }
+
+    /// Median depth error on the body (m), share of points off the body, share of body pixels near a point, intersection over union.
+    fn score(rig: &Rig, frame: &FrameCloud, folder: &Path, number: usize) -> [f64; 4] {
+        let truth = grey(folder.join(format!("truth/mask_cam_00/{number:06}.png")));
+        let depth = image::open(folder.join(format!("truth/depth_cam_00/{number:06}.png"))).unwrap().into_luma16();
+        let (wide, tight) = (super::super::masks::box_vote(&truth, 2, 0.0), super::super::masks::box_vote(&truth, 2, 0.999));
+        let mut covered = GrayImage::new(640, 480);
+        let (mut errors, mut off) = (Vec::new(), 0.0);
+        for point in &frame.cloud.points {
+            let pixel = rig.cameras[0].project(&point.position).unwrap();
+            let (x, y) = (pixel.x.round() as u32, pixel.y.round() as u32);
+            off += f64::from(u8::from(wide.get_pixel(x, y).0[0] == 0));
+            covered.put_pixel(x, y, Luma([255]));
+            if tight.get_pixel(x, y).0[0] != 0 {
+                let z = f64::from(depth.get_pixel(x, y).0[0]) * 1e-4;
+                errors.push((rig.cameras[0].camera_point(&point.position).z - z).abs());
+            }
+        }
+        let covered = super::super::masks::box_vote(&covered, 1, 0.0);
+        let count = |f: &dyn Fn(bool, bool, bool) -> bool| {
+            let mask = frame.masks[0].as_ref().unwrap();
+            let all = truth.iter().zip(mask.iter()).zip(covered.iter());
+            all.filter(|((t, m), c)| f(**t != 0, **m != 0, **c != 0)).count() as f64
+        };
+        let overlap = count(&|t, m, _| t && m) / count(&|t, m, _| t || m);
+        let density = count(&|t, _, c| t && c) / count(&|t, _, _| t);
+        [median(errors), off / frame.cloud.points.len() as f64, density, overlap]
+    }
+
+    #[test]
+    fn clouds_and_masks_meet_the_rendered_truth() {
+        // Depth limits are OpenCV SGBM's medians on the same sessions.
+        for (name, depth_m, overlap) in [
+            ("p02_run_lab", 0.0120, 0.85),
+            ("p12_walk_lab", 0.0088, 0.88),
+            ("p35_walk_lab_slow", 0.0108, 0.85),
+            ("p39_walk_digiclops", 0.0255, 0.9),
+        ] {
+            let Some(folder) = footage(name) else { return };
+            let options = CloudOptions::default();
+            let (rig, ready) = ready(&folder, &options);
+            let frame = ready.frame(&pictures(&folder, 20), &options).unwrap();
+            let [error, off, density, iou] = score(&rig, &frame, &folder, 20);
+            println!("{name}: {:.1} mm, {:.2} % off the body, density {density:.3}, IoU {iou:.3}", 1e3 * error, 100.0 * off);
+            assert!(error < depth_m && off < 0.03 && density > 0.85 && iou > overlap, "{name}: {error} {off} {density} {iou}");
+        }
+    }
+
+    #[test]
+    fn an_empty_stage_gives_an_empty_cloud() {
+        let Some(folder) = footage("p39_walk_digiclops") else { return };
+        let options = CloudOptions::default();
+        let (_, ready) = ready(&folder, &options);
+        let stage: Vec<GrayImage> = (0..3).map(|k| grey(folder.join(format!("cam_0{k}_background.png")))).collect();
+        let frame = ready.frame(&stage, &options).unwrap();
+        assert!(frame.cloud.points.is_empty());
+        assert!(frame.masks.iter().all(|m| m.as_ref().unwrap().iter().all(|&v| v == 0)));
+        assert!(ready.frame(&stage[..2], &options).is_err());
+        let small: Vec<GrayImage> = (0..3).map(|_| GrayImage::new(320, 240)).collect();
+        assert!(matches!(ready.frame(&small, &options), Err(CloudError::Size { .. })));
+    }
+
+    #[test]
+    fn threads_change_nothing() {
+        let Some(folder) = footage("p12_walk_lab") else { return };
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let options = CloudOptions { voxel_m: Some(0.02), ..CloudOptions::default() };
+                let (_, ready) = ready(&folder, &options);
+                ready.frame(&pictures(&folder, 10), &options).unwrap()
+            })
+        };
+        let (one, four) = (run(1), run(4));
+        assert!(one.cloud.points.len() > 500);
+        assert_eq!(one.cloud, four.cloud);
+        assert_eq!(one.masks, four.masks);
+    }
+}

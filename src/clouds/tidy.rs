@@ -1,0 +1,108 @@
+//! Lone points out, thinning.
+//!
+//! A point goes when the mean distance to its k nearest neighbours, in units of its own standard deviation, exceeds the
+//! cloud's median by more than c median deviations (PCL's statistical outlier filter, with the median for the mean, because a
+//! cloud of few points must not excuse its own outliers).
+
+use super::cloud::{Cloud, CloudPoint};
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use std::collections::BTreeMap;
+use std::num::NonZero;
+
+/// Neighbours that a point is judged by; fewer let pairs of outliers excuse each other.
+const NEIGHBOURS: usize = 12;
+
+/// c: robust standard deviations of the neighbour distance.
+const OUTLIER_LIMIT: f64 = 6.0;
+
+/// Clouds of fewer points are not judged.
+const FEWEST_POINTS: usize = 50;
+
+/// The cloud without its lone points.
+pub fn remove_outliers(cloud: Cloud) -> Cloud {
+    let places: Vec<[f64; 3]> = cloud.points.iter().map(|p| p.position.into()).collect();
+    if places.len() < FEWEST_POINTS {
+        return cloud;
+    }
+    // More points than a bucket at one place make the tree refuse; such a cloud is left as it is.
+    let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&places) else { return cloud };
+    let wanted = NonZero::new(NEIGHBOURS + 1).unwrap_or(NonZero::<usize>::MIN);
+    let spread = |(point, at): (&CloudPoint, &[f64; 3])| {
+        let near = tree.query(at).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+        let mean = near.iter().map(|n| n.distance.sqrt()).sum::<f64>() / NEIGHBOURS as f64;
+        mean / point.covariance.trace().max(1e-12).sqrt()
+    };
+    let spreads: Vec<f64> = cloud.points.iter().zip(&places).map(spread).collect();
+    let middle = median(spreads.clone());
+    let deviation = 1.4826 * median(spreads.iter().map(|s| (s - middle).abs()).collect());
+    let limit = middle + OUTLIER_LIMIT * deviation.max(0.15 * middle);
+    Cloud { points: cloud.points.into_iter().zip(spreads).filter(|(_, s)| *s <= limit).map(|(p, _)| p).collect() }
+}
+
+/// The most confident point of every cube of side `voxel_m`, in the order of the cloud.
+pub fn thin(cloud: Cloud, voxel_m: f64) -> Cloud {
+    let mut best: BTreeMap<[i64; 3], usize> = BTreeMap::new();
+    for (i, point) in cloud.points.iter().enumerate() {
+        let cube: [i64; 3] = point.position.map(|x| (x / voxel_m).floor() as i64).into();
+        let kept = best.entry(cube).or_insert(i);
+        if point.confidence > cloud.points[*kept].confidence {
+            *kept = i;
+        }
+    }
+    let mut kept: Vec<usize> = best.into_values().collect();
+    kept.sort_unstable();
+    Cloud { points: kept.into_iter().map(|i| cloud.points[i].clone()).collect() }
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix3, Vector3};
+
+    fn point(x: f64, y: f64, z: f64) -> CloudPoint {
+        CloudPoint { position: Vector3::new(x, y, z), colour: [0; 3], confidence: x, covariance: Matrix3::identity() * 1e-4 }
+    }
+
+    fn sheet() -> Cloud {
+        let mut points: Vec<_> =
+            (0..900).map(|i| point(f64::from(i % 30) * 0.01, f64::from(i / 30) * 0.01, 0.002 * f64::from(i * 7 % 5))).collect();
+        points.push(point(0.15, 0.15, 0.5));
+        points.push(point(0.9, 0.1, 0.0));
+        points.push(point(0.9, 0.1, 0.01));
+        Cloud { points }
+    }
+
+    #[test]
+    fn lone_points_go_and_the_sheet_stays() {
+        let kept = remove_outliers(sheet());
+        assert_eq!(kept.points.len(), 900);
+        assert!(kept.points.iter().all(|p| p.position.x < 0.5 && p.position.z < 0.1));
+    }
+
+    #[test]
+    fn distances_meet_brute_force() {
+        let cloud = sheet();
+        let places: Vec<[f64; 3]> = cloud.points.iter().map(|p| p.position.into()).collect();
+        let tree = ImmutableKdTree::<f64, 3>::new_from_slice(&places).unwrap();
+        for at in &places {
+            let near = tree.query(at).nearest_n::<SquaredEuclidean<f64>>(NonZero::new(NEIGHBOURS + 1).unwrap()).execute();
+            let mut all: Vec<f64> = places.iter().map(|p| (0..3).map(|k| (p[k] - at[k]).powi(2)).sum()).collect();
+            all.sort_by(f64::total_cmp);
+            let (ours, theirs): (f64, f64) = (near.iter().map(|n| n.distance).sum(), all[..=NEIGHBOURS].iter().sum());
+            assert!((ours - theirs).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn thinning_keeps_the_most_confident_of_each_cube() {
+        let thinned = thin(sheet(), 0.1);
+        assert!(thinned.points.len() < 20);
+        assert!(thinned.points.iter().any(|p| (p.position.x - 0.09).abs() < 1e-9));
+        assert_eq!(thin(Cloud::default(), 0.1), Cloud::default());
+    }
+}

@@ -1,0 +1,295 @@
+//! Walking and running cycles whose feet keep to the floor.
+//!
+//! From a subject's angles over the cycle: each foot is laid flat between foot-flat and heel-off by the ankle, the toes
+//! bend while the heel is up, the hip's amplitude is scaled so that the standing foot travels one stride per cycle, the
+//! root follows the standing feet (ground.rs; a runner's root bounces under gravity), what still slides is taken up
+//! by small turns of hip, knee and ankle, and a swinging foot is lifted over the floor.
+
+use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
+
+use super::posture::{Angles, FOOT_LENGTH, Side, Soles, above_zero};
+use super::variation::{Channel, TRACKS, Tracks, phase, track};
+use super::{GRAVITY, SyntheticSubject, ground};
+use crate::math::curves::{Pchip, hermite, low_pass, smooth_step};
+use crate::math::rotation::log;
+use crate::motion_model::cycle::{RootSample, SAMPLES};
+
+/// Harmonics kept of the root's path: fewer lose the dip at heel strike, more keep the jitter of changing contact points.
+const ROOT_HARMONICS: usize = 6;
+/// Weights of hip, knee and ankle in keeping the toes on the floor: more ankle leaves the foot standing on its tip.
+const WILLING: Vector3<f64> = Vector3::new(1.0, 1.5, 0.25);
+/// Shares of hip flexion, knee flexion and dorsiflexion in lifting a swinging foot.
+const LIFT: Vector3<f64> = Vector3::new(0.3, 0.6, 0.8);
+const LIFT_HEEL: Vector3<f64> = Vector3::new(0.5, 1.0, 0.0);
+/// Height of the sole over the floor in mid swing, at least.
+const CLEARANCE_M: f64 = 0.012;
+/// How far the ankle stretches at push-off, radians.
+const PLANTARFLEXION_LIMIT: f64 = 0.55;
+/// How much lower than at take-off a runner lands at most.
+const MOST_DROP_M: f64 = 0.05;
+/// A leg that carries does not stretch beyond this, radians.
+const KNEE_LIMIT: f64 = 0.10;
+/// How far the toes bend up, radians.
+const TOE_LIMIT: f64 = 0.6;
+
+/// How the feet meet the floor. Phases count from the foot's own strike.
+pub(super) struct Gait {
+    pub cycle_s: f64,
+    pub stride_m: f64,
+    /// Share of the cycle that a foot stands.
+    pub support: f64,
+    /// From and until when a foot says how high and how fast the root goes.
+    pub leads: (f64, f64),
+    pub laid_flat: (f64, f64),
+    pub heel_rises: (f64, f64),
+    /// From and until when a foot lets go of the floor, after the end of its support.
+    pub lets_go: (f64, f64),
+    /// The root's height obeys gravity between the steps instead of following the feet.
+    pub bounces: bool,
+    /// Sway to the left in units of H.
+    pub sway: fn(f64) -> f64,
+    /// Factor on the subject's step width in walking.
+    pub step_width: f64,
+}
+
+/// Postures and root of one cycle. `tracks` hold the subject's angles; `cycle_s` the duration.
+pub(super) fn cycle(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait) -> (Vec<Angles>, Vec<RootSample>) {
+    // The stride is nearly proportional to the hip's amplitude: a few secant steps close it.
+    let mut gain = 1.0;
+    let mut angles = angles(subject, tracks, gait, gain);
+    let mut path = leading_path(subject, gait, &angles);
+    for _ in 0..3 {
+        gain *= (gait.stride_m / path.stride_m).clamp(0.5, 2.0);
+        angles = self::angles(subject, tracks, gait, gain);
+        path = leading_path(subject, gait, &angles);
+    }
+    for side in 0..2 {
+        plant(subject, &mut angles, &path, side, gait);
+        clear_floor(subject, &mut angles, &path, side, gait);
+    }
+    let h = subject.hip_height_m;
+    let drift = |i: usize| path.ahead_m[i] - path.stride_m * phase(i);
+    let mean = (0..SAMPLES).map(drift).sum::<f64>() / SAMPLES as f64;
+    let root = (0..SAMPLES).map(|i| RootSample {
+        rotation: log(&angles[i].carrier_from_root()),
+        position: Vector3::new((gait.sway)(phase(i)), path.height_m[i] / h - 1.0, (drift(i) - mean) / h),
+    });
+    let root = root.collect();
+    (angles, root)
+}
+
+/// Root over one cycle, metres.
+struct Path {
+    height_m: Vec<f64>,
+    ahead_m: Vec<f64>,
+    stride_m: f64,
+}
+
+/// Height and progress as the leading foot dictates, from its heel strike until its heel rises; in between smoothly on.
+fn leading_path(subject: &SyntheticSubject, gait: &Gait, angles: &[Angles]) -> Path {
+    let soles: Vec<Soles> = angles.iter().map(|a| subject.soles(a).0).collect();
+    let leads = |t: f64| if (gait.leads.0..gait.leads.1).contains(&t) { 1.0 } else { 0.0 };
+    let contact: Vec<_> = (0..SAMPLES).map(|i| [leads(own_phase(i, 0)), leads(own_phase(i, 1))]).collect();
+    let bridged = |values: Vec<Option<f64>>| {
+        let known: Vec<_> = values.iter().enumerate().filter_map(|(i, v)| Some((phase(i), (*v)?))).collect();
+        let curve = Pchip::periodic(&known);
+        let all: Vec<_> = (0..SAMPLES).map(|i| curve.at(phase(i))).collect();
+        low_pass(&all, ROOT_HARMONICS)
+    };
+    let heights = ground::heights(&soles, &contact);
+    let height_m = if gait.bounces { bounce(gait, &heights) } else { bridged(heights) };
+    let steps = bridged(ground::steps(&soles, &contact).into_iter().map(|s| Some(s?.z)).collect());
+    let mut ahead_m = vec![0.0; SAMPLES];
+    for i in 1..SAMPLES {
+        ahead_m[i] = ahead_m[i - 1] + steps[i - 1];
+    }
+    let stride_m: f64 = steps.iter().sum();
+    let drift: Vec<_> = ahead_m.iter().enumerate().map(|(i, z)| z - stride_m * phase(i)).collect();
+    let ahead_m = low_pass(&drift, 3).iter().enumerate().map(|(i, z)| z + stride_m * phase(i)).collect();
+    Path { height_m, ahead_m, stride_m }
+}
+
+/// Root height of a runner: a parabola under gravity while no foot stands, a cubic while one does that continues it
+/// in height and speed. Level and drop (a runner lands lower than it takes off) by least squares against
+/// the height that the standing legs give.
+fn bounce(gait: &Gait, heights: &[Option<f64>]) -> Vec<f64> {
+    let (stance_s, flight_s) = (gait.support * gait.cycle_s, (0.5 - gait.support) * gait.cycle_s);
+    let shape = |drop: f64, i: usize| {
+        let (up, down) = (0.5 * GRAVITY * flight_s - drop / flight_s, 0.5 * GRAVITY * flight_s + drop / flight_s);
+        let s = phase(i).rem_euclid(0.5) * gait.cycle_s - stance_s;
+        let stance = || hermite(&[-stance_s, -drop, -down], &[0.0, 0.0, up], s);
+        if s < 0.0 { stance() } else { up * s - 0.5 * GRAVITY * s * s }
+    };
+    let known: Vec<_> = heights.iter().enumerate().filter_map(|(i, h)| Some((i, (*h)?))).collect();
+    let mean = |value: &dyn Fn(usize, f64) -> f64| known.iter().map(|&(i, h)| value(i, h)).sum::<f64>() / known.len() as f64;
+    let effect = |i: usize| shape(1.0, i) - shape(0.0, i);
+    let (gap, slope) = (mean(&|i, h| h - shape(0.0, i)), mean(&|i, _| effect(i)));
+    let covariance = mean(&|i, h| (h - shape(0.0, i) - gap) * (effect(i) - slope));
+    let drop = (covariance / mean(&|i, _| (effect(i) - slope).powi(2))).clamp(0.0, MOST_DROP_M);
+    let level = gap - drop * slope;
+    (0..SAMPLES).map(|i| level + shape(drop, i)).collect()
+}
+
+/// A standing foot stays where it is: the hip gives way while the foot is flat, hip, knee and ankle while the heel is up.
+/// Before heel strike and after toe-off the correction fades.
+fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: usize, gait: &Gait) {
+    let strike = if side == 0 { SAMPLES / 2 } else { 0 };
+    let at = |k: usize| (strike + k) % SAMPLES;
+    let ahead = |k: usize| path.ahead_m[at(k)] + path.stride_m * ((strike + k) / SAMPLES) as f64;
+    let flat: Vec<usize> = (0..SAMPLES).filter(|&k| (gait.laid_flat.1..gait.heel_rises.0).contains(&phase(k))).collect();
+    let toe_z = flat.iter().map(|&k| ahead(k) + subject.soles(&angles[at(k)]).0[side][2].z).sum::<f64>() / flat.len() as f64;
+    let turns: Vec<Vector3<f64>> = (0..=(gait.support * SAMPLES as f64) as usize)
+        .map(|k| {
+            let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
+            let target = [toe_z - ahead(k), -path.height_m[at(k)]];
+            let hold = hold_flat(subject, &angles[at(k)], side, phase(k), target, gait);
+            let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait) } else { hold };
+            hold.lerp(&stand, rise)
+        })
+        .collect();
+    let (first, last) = (turns[0], turns[turns.len() - 1]);
+    for k in 0..SAMPLES {
+        let t = phase(k);
+        let fade_out = 1.0 - smooth_step(gait.support + gait.lets_go.0, gait.support + gait.lets_go.1, t);
+        let by = turns.get(k).unwrap_or(&last) * fade_out + first * smooth_step(0.85, 1.0, t);
+        turn(&mut angles[at(k)].sides[side], &by);
+        bend_toes(subject, &mut angles[at(k)], side, t, gait);
+    }
+}
+
+/// Turn of the hip (and of the knee in running, whose root moves by its own law), undone at the ankle, that puts the toe
+/// tip at `target` z, or the heel where it must be for that, and the lowest sole point at its y.
+fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
+    let toe_share = smooth_step(0.03, 0.12, t);
+    let of_hip_and_knee = |v: &Vector2<f64>| Vector3::new(v.x, v.y, v.y - v.x);
+    let miss = |v: &Vector2<f64>| {
+        let mut angles = *angles;
+        turn(&mut angles.sides[side], &of_hip_and_knee(v));
+        let [heel, ball, toe] = subject.soles(&angles).0[side];
+        let z = toe_share * toe.z + (1.0 - toe_share) * (heel.z + FOOT_LENGTH * subject.stature_m) - target[0];
+        Vector2::new(z, heel.y.min(ball.y).min(toe.y) - target[1])
+    };
+    let mut v = Vector2::zeros();
+    for _ in 0..6 {
+        let here = miss(&v);
+        let by_hip = (miss(&(v + Vector2::x() * 1e-4)) - here) / 1e-4;
+        let most = KNEE_LIMIT - angles.sides[side].knee;
+        let mut step = Vector2::new(here.x / by_hip.x.max(0.3 * subject.hip_height_m), 0.0);
+        if gait.bounces {
+            let by_knee = (miss(&(v + Vector2::y() * 1e-4)) - here) / 1e-4;
+            let jacobian = Matrix2::from_columns(&[by_hip, by_knee]);
+            let normal = jacobian.transpose() * jacobian + Matrix2::identity() * 1e-4;
+            let Some(inverse) = normal.try_inverse() else { break };
+            let both = inverse * jacobian.transpose() * here;
+            // A stretched leg that is still too short only turns at the hip.
+            let stretched = Vector2::new(step.x, (v.y - most).max(0.0));
+            step = if v.y - both.y < most { stretched } else { both };
+        }
+        v -= step * (0.2 / step.norm().max(0.2));
+    }
+    of_hip_and_knee(&v)
+}
+
+/// Turns of hip, knee and ankle with the smallest weighted norm that put the toe tip at `target` z, and the lower of ball
+/// and toe tip at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher.
+fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
+    let miss = |by: &Vector3<f64>| {
+        let mut angles = *angles;
+        turn(&mut angles.sides[side], by);
+        bend_toes(subject, &mut angles, side, gait.heel_rises.1.min(gait.support), gait);
+        let [_, ball, toe] = subject.soles(&angles).0[side];
+        Vector2::new(toe.z - target[0], ball.y.min(toe.y) - target[1])
+    };
+    let mut by = Vector3::zeros();
+    for _ in 0..8 {
+        let here = miss(&by);
+        let jacobian = Matrix2x3::from_columns(&[0, 1, 2].map(|k| (miss(&(by + Vector3::ith(k, 1e-4))) - here) / 1e-4));
+        let spread = jacobian * Matrix3::from_diagonal(&WILLING);
+        let Some(inverse) = (spread * jacobian.transpose() + Matrix2::identity() * 1e-4).try_inverse() else { break };
+        let step = spread.transpose() * inverse * here;
+        by -= step * (0.2 / step.norm().max(0.2));
+        by.y = by.y.max((KNEE_LIMIT - angles.sides[side].knee).min(0.0));
+        by.z = by.z.max(-PLANTARFLEXION_LIMIT - angles.sides[side].ankle);
+    }
+    by
+}
+
+fn turn(leg: &mut Side, by: &Vector3<f64>) {
+    leg.hip_flexion += by.x;
+    leg.knee += by.y;
+    leg.ankle += by.z;
+}
+
+/// A swinging foot that would touch the floor is lifted by ankle, knee and hip.
+fn clear_floor(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: usize, gait: &Gait) {
+    let lowest = |angles: &Angles| {
+        let [heel, ball, toe] = subject.soles(angles).0[side].map(|p| p.y);
+        // The heel comes down by itself at the end of the swing: dorsiflexion is for the rest of the foot.
+        if heel < ball.min(toe) { (heel + CLEARANCE_M, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
+    };
+    for _ in 0..2 {
+        let lift = |i: usize| {
+            let swing = (own_phase(i, side) - gait.support - 0.04) / (0.99 - gait.support);
+            let wanted = CLEARANCE_M * (std::f64::consts::PI * swing.clamp(0.0, 1.0)).sin().sqrt();
+            let (height, way) = lowest(&angles[i]);
+            let lack = if (0.0..1.0).contains(&swing) { (wanted - path.height_m[i] - height).max(0.0) } else { 0.0 };
+            let mut moved = angles[i];
+            turn(&mut moved.sides[side], &(way * 1e-3));
+            let rate = (lowest(&moved).0 - height) / 1e-3;
+            way * (lack / rate.max(0.1 * subject.hip_height_m))
+        };
+        let lifts: Vec<_> = (0..SAMPLES).map(lift).collect();
+        for (i, angles) in angles.iter_mut().enumerate() {
+            // The widened maximum keeps the lift smooth and still enough where it is needed.
+            let widest = |i: usize| (0..=8).map(|k| lifts[(i + SAMPLES + k - 4) % SAMPLES]).fold(Vector3::zeros(), |a, b| a.sup(&b));
+            let smooth = (0..=8).map(|k| widest((i + SAMPLES + k - 4) % SAMPLES)).sum::<Vector3<f64>>() / 9.0;
+            turn(&mut angles.sides[side], &smooth);
+        }
+    }
+}
+
+/// Phase of a sample from the side's own heel strike.
+fn own_phase(sample: usize, side: usize) -> f64 {
+    phase((sample + if side == 0 { SAMPLES / 2 } else { 0 }) % SAMPLES)
+}
+
+/// Angles with the hip's swing multiplied by `gain`, feet under the body, flat in mid stance.
+fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -> Vec<Angles> {
+    let mut mean = [0.0; TRACKS];
+    for sample in tracks {
+        for (m, y) in mean.iter_mut().zip(sample) {
+            *m += y / SAMPLES as f64;
+        }
+    }
+    let at = |(i, sample): (usize, &[f64; TRACKS])| {
+        let mut sample = *sample;
+        for side in 0..2 {
+            let hip = track(Channel::HipFlexion, side);
+            sample[hip] = mean[hip] + gain * (sample[hip] - mean[hip]);
+        }
+        let mut angles = Angles::from_tracks(&sample);
+        for side in 0..2 {
+            let sign = if side == 0 { 1.0 } else { -1.0 };
+            let adduction = sample[track(Channel::HipAdduction, side)] - mean[track(Channel::HipAdduction, side)];
+            let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.3 * adduction.to_radians();
+            for _ in 0..2 {
+                let [heel, _, toe] = subject.soles(&angles).0[side];
+                angles.sides[side].leg_lateral += foot_x - 0.5 * (heel.x + toe.x) / subject.hip_height_m;
+            }
+            let t = own_phase(i, side);
+            let flat = smooth_step(gait.laid_flat.0, gait.laid_flat.1, t) * (1.0 - smooth_step(gait.heel_rises.0, gait.heel_rises.1, t));
+            angles.sides[side].ankle -= flat * subject.soles(&angles).1[side];
+            bend_toes(subject, &mut angles, side, t, gait);
+        }
+        angles
+    };
+    tracks.iter().enumerate().map(at).collect()
+}
+
+/// Toes stay level while the heel is up, as far as they bend, and stretch after toe-off.
+fn bend_toes(subject: &SyntheticSubject, angles: &mut Angles, side: usize, t: f64, gait: &Gait) {
+    let heel_up = above_zero(-subject.soles(angles).1[side], 0.03);
+    let (rises, off) = (gait.heel_rises.0, gait.support);
+    let standing = smooth_step(rises - 0.12, rises - 0.02, t) * (1.0 - smooth_step(off, off + 0.15, t));
+    angles.sides[side].toe = standing * TOE_LIMIT * (heel_up / TOE_LIMIT).tanh();
+}
