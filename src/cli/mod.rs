@@ -1,6 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod clouds;
 
+mod check;
 mod disparity;
 mod generate;
 mod model;
@@ -25,6 +26,8 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// What is wrong with a session and what to do, before any long work
+    Check(check::CheckArgs),
     /// The person's point cloud in every frame of a session, as PLY files
     Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
@@ -40,10 +43,21 @@ enum Command {
     Render(render::RenderArgs),
 }
 
+/// OpenCV and FFmpeg print about damaged files on stderr, where our own one sentence belongs; their own variables decide.
+pub fn silence_opencv() {
+    for (variable, quiet) in [("OPENCV_LOG_LEVEL", "SILENT"), ("OPENCV_FFMPEG_LOGLEVEL", "-8")] {
+        if std::env::var_os(variable).is_none() {
+            // SAFETY: called first in main, while there is no other thread that could read the environment.
+            unsafe { std::env::set_var(variable, quiet) };
+        }
+    }
+}
+
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
+        Command::Check(args) => check::run(&args),
         Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),

@@ -240,7 +240,7 @@ mod tests {
         let empty = picture(&mut |x, y| stage(x, y) + noise());
         let seen = picture(&mut |x, y| {
             let light = match (inside(x, y), in_shadow(x, y)) {
-                (true, _) => 120.0 + person_contrast + 15.0 * (x / 3.0).sin() * (y / 4.0).cos(),
+                (true, _) => 120.0 + person_contrast + 35.0 * (x / 2.0).sin() * (y / 2.5).cos(),
                 (false, true) => 0.75 * stage(x, y),
                 _ => stage(x, y),
             };

@@ -203,7 +203,8 @@ up = "y"
         let mut rig = read_text(TWO_CAMERAS).unwrap();
         rig.cameras[0].name = "gauche 1".into();
         // Half a turn is where rotation vectors are hardest.
-        rig.cameras[0].camera_from_world = rotation::exp(&(Vector3::new(0.6, -0.48, 0.64) * 3.141_592)).to_rotation_matrix();
+        rig.cameras[0].camera_from_world =
+            rotation::exp(&(Vector3::new(0.6, -0.48, 0.64) * (std::f64::consts::PI - 1e-6))).to_rotation_matrix();
         rig.cameras[1].distortion[4] = 1.0 / 3.0e9;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("out/Calib.toml");

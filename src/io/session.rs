@@ -7,7 +7,7 @@
 use super::calib_toml::{self, CalibError};
 use super::images::{self, ImageError};
 use super::video::{self, Video, VideoError, VideoFacts};
-use crate::footage::FrameSet;
+use crate::footage::{self, FrameSet};
 use crate::rig::{Camera, Rig};
 use image::GrayImage;
 use rayon::prelude::*;
@@ -16,6 +16,8 @@ use std::path::{Path, PathBuf};
 
 /// Frame rate of pictures without any word about it, 1/s.
 const DEFAULT_FPS: f64 = 30.0;
+/// Frames whose median is the empty stage where there is no picture of it.
+const STAGE_FRAMES: usize = 25;
 /// Headers of whole videos promise up to this many frames more than they hold.
 const HEADER_EXCESS_FRAMES: usize = 2;
 
@@ -131,6 +133,23 @@ impl Session {
     /// All frames in order, read one after the other; ends after the first error.
     pub fn frames(&self) -> Frames<'_> {
         Frames { session: self, next: 0, videos: Vec::new() }
+    }
+
+    /// The empty stage of every camera: its picture, else the median over frames spread over the session.
+    pub fn stages(&self) -> Result<Vec<GrayImage>, SessionError> {
+        if let Some(backgrounds) = &self.backgrounds {
+            return Ok(backgrounds.clone());
+        }
+        let chosen = footage::spread(self.frame_count, STAGE_FRAMES);
+        let frames: Vec<FrameSet> = if self.has_random_access() {
+            chosen.par_iter().map(|&index| self.frame(index)).collect::<Result<_, _>>()?
+        } else {
+            let wanted = self.frames().enumerate().filter(|(index, frame)| frame.is_err() || chosen.contains(index));
+            wanted.map(|(_, frame)| frame).collect::<Result<_, _>>()?
+        };
+        let of_camera = |k: usize| frames.iter().map(|frame| frame.images[k].clone()).collect::<Vec<_>>();
+        // There is at least one frame, and all are of the camera's size.
+        Ok((0..self.cameras.len()).filter_map(|k| footage::stage_from_frames(&of_camera(k))).collect())
     }
 
     /// Whether [`frame`](Self::frame) works: pictures can be read in any order and from several threads, videos cannot.

@@ -137,10 +137,8 @@ mod tests {
     #[test]
     fn projection_matches_opencv() {
         let camera = camera();
-        let points: Vec<_> = (0..60)
-            .map(|i| f64::from(i))
-            .map(|i| Vector3::new((i * 0.7).sin(), 3.0 + (i * 0.3).cos(), 1.0 + 0.8 * (i * 1.1).sin()))
-            .collect();
+        let points: Vec<_> =
+            (0..60).map(f64::from).map(|i| Vector3::new((i * 0.7).sin(), 3.0 + (i * 0.3).cos(), 1.0 + 0.8 * (i * 1.1).sin())).collect();
         let objects: CvVector<Point3d> = points.iter().map(|p| Point3d::new(p.x, p.y, p.z)).collect();
         let rotation = camera.camera_from_world.scaled_axis();
         let mut pixels = CvVector::<Point2d>::new();
