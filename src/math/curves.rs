@@ -93,3 +93,61 @@ pub fn low_pass(period: &[f64], harmonics: usize) -> Vec<f64> {
     }
     kept
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KNEE: [(f64, f64); 4] = [(0.17, 3.0), (0.4, 25.0), (0.75, 70.0), (1.0, 3.0)];
+
+    /// `scipy.interpolate.PchipInterpolator` (1.17) on three repetitions of KNEE.
+    const SCIPY: [(f64, f64); 5] =
+        [(0.0, 3.0), (0.3, 12.670652917116229), (0.55, 48.03034551206502), (0.9, 26.584), (1.3, 12.670652917116247)];
+
+    #[test]
+    fn periodic_pchip_matches_scipy() {
+        let curve = Pchip::periodic(&KNEE);
+        for (t, y) in SCIPY {
+            assert!((curve.at(t) - y).abs() < 1e-9, "{t}: {} {y}", curve.at(t));
+            assert!((curve.at(t - 3.0) - y).abs() < 1e-9, "{t}");
+        }
+    }
+
+    #[test]
+    fn a_repeated_last_point_changes_nothing() {
+        let [a, b] = [Pchip::periodic(&[(-0.1, 25.0), (0.5, -15.0), (0.9, 25.0)]), Pchip::periodic(&[(-0.1, 25.0), (0.5, -15.0)])];
+        for k in 0..20 {
+            let t = f64::from(k) / 20.0;
+            assert!((a.at(t) - b.at(t)).abs() < 1e-12 && a.at(t).is_finite());
+        }
+    }
+
+    #[test]
+    fn open_pchip_passes_through_its_points_and_never_overshoots() {
+        let points = [(0.0, 0.0), (1.0, 1.0), (1.5, 4.0), (4.0, 5.0)];
+        let curve = Pchip::open(&points);
+        assert!(points.iter().all(|&(x, y)| (curve.at(x) - y).abs() < 1e-12));
+        let values: Vec<f64> = (-10..=50).map(|k| curve.at(f64::from(k) / 10.0)).collect();
+        assert!(values.windows(2).all(|w| w[1] >= w[0] - 1e-12) && values[0] == 0.0 && values[60] == 5.0);
+    }
+
+    #[test]
+    fn low_pass_keeps_low_and_drops_high_harmonics() {
+        let wave = |k: f64, i: usize| (TAU * k * i as f64 / 100.0 + 0.3).sin();
+        let mixed: Vec<f64> = (0..100).map(|i| 2.0 + wave(1.0, i) + 0.5 * wave(3.0, i) + wave(7.0, i)).collect();
+        for (i, y) in low_pass(&mixed, 3).iter().enumerate() {
+            assert!((y - 2.0 - wave(1.0, i) - 0.5 * wave(3.0, i)).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn smooth_step_has_the_slope_of_its_closed_form() {
+        // d/dx = 30 t² (1 − t)² / (b − a)
+        for k in 0..=10 {
+            let t = f64::from(k) / 10.0;
+            let x = 2.0 + 3.0 * t;
+            let slope = (smooth_step(2.0, 5.0, x + 1e-6) - smooth_step(2.0, 5.0, x - 1e-6)) / 2e-6;
+            assert!((slope - 10.0 * t * t * (1.0 - t) * (1.0 - t)).abs() < 1e-6);
+        }
+    }
+}

@@ -222,7 +222,7 @@ pub(super) fn jump(subject: &SyntheticSubject, tracks: &Tracks, habit: &Habit, l
         let s = phase(i) * duration_s;
         let (ahead, up) = flight.root(s);
         let root = Vector3::new(0.0, subject.offsets[Joint::Root as usize].y + up, ahead);
-        let mut angles = Angles::from_tracks(&between(tracks, flight.phase(s)));
+        let mut angles = Angles::from_tracks(&between(tracks, flight.phase(s)), &subject.offsets);
         for side in 0..2 {
             angles.sides[side].shoulder = angles.sides[side].shoulder.clamp(-1.3, 2.9);
             let foot = flight.foot(subject, habit.tuck, s);
@@ -247,7 +247,7 @@ fn step_into(
 ) {
     let (ankle, pitch, toe) = foot;
     let sign = if side == 0 { 1.0 } else { -1.0 };
-    let hip = root + angles.carrier_from_root() * subject.offsets[if side == 0 { Joint::LHip } else { Joint::RHip } as usize];
+    let hip = root + angles.sides[side].hip;
     let (thigh, shank) = (-subject.offsets[Joint::LKnee as usize].y, -subject.offsets[Joint::LAnkle as usize].y);
     let down = hip.y - ankle.x;
     let ahead = ankle.y + 0.5 * sign * habit.stagger * subject.hip_height_m - hip.z;
@@ -273,9 +273,9 @@ fn between(tracks: &Tracks, u: f64) -> [f64; TRACKS] {
     std::array::from_fn(|k| tracks[i][k] * (1.0 - w) + tracks[i + 1][k] * w)
 }
 
-/// Flight in time: take-off and landing, seconds after the start, and the duration.
+/// Times of take-off, landing and end of a subject's mean jump, seconds.
 #[cfg(test)]
-pub(super) fn events(subject: &SyntheticSubject, habit: &Habit, length: f64) -> [f64; 3] {
-    let flight = flight(subject, habit, length);
+pub(super) fn events(subject: &SyntheticSubject, length: f64) -> [f64; 3] {
+    let flight = flight(subject, &subject.habit, length);
     [flight.times[1], flight.times[2], flight.times[4]]
 }

@@ -90,8 +90,8 @@ impl SyntheticSubject {
         self.make(parameter, None)
     }
 
-    fn soles(&self, angles: &posture::Angles) -> (posture::Soles, [f64; 2]) {
-        angles.soles(&self.offsets, self.stature_m)
+    fn sole(&self, angles: &Angles, side: usize) -> (posture::Sole, f64) {
+        angles.sole(side, &self.offsets, self.stature_m)
     }
 
     fn make(&self, parameter: f64, repeat: Option<u32>) -> Cycle {
@@ -172,3 +172,6 @@ pub fn database(activity: Activity) -> Vec<Cycle> {
     let by_subject: Vec<_> = (1..=subjects(activity)).into_par_iter().map(of_subject).collect();
     by_subject.into_iter().flatten().collect()
 }
+
+#[cfg(test)]
+mod tests;

@@ -3,7 +3,7 @@
 //! Signs, with the body's x left, y up, z forward: flexion of hip and elbow, and of the shoulder (arm forward) turn by −x,
 //! of the knee by +x, dorsiflexion by −x; rotations about y and z have opposite signs on the two sides.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use super::variation::{Channel, TRACKS, track};
 use crate::body::{BALL_JOINTS, Joint, NODES};
@@ -20,16 +20,19 @@ const TOE_FORWARD: f64 = 0.055;
 pub(super) const FOOT_LENGTH: f64 = HEEL_BACK + 0.050 + TOE_FORWARD;
 /// Lowest points of a foot: heel, ball, toe tip.
 pub(super) const SOLE_POINTS: usize = 3;
-/// The sole points of both feet, left first, relative to the root, metres.
-pub(super) type Soles = [[Vector3<f64>; SOLE_POINTS]; 2];
+/// The sole points of a foot relative to the root, metres.
+pub(super) type Sole = [Vector3<f64>; SOLE_POINTS];
+/// Of both feet, left first.
+pub(super) type Soles = [Sole; 2];
 
 /// Angles of one side, radians.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Side {
+    /// Hip joint relative to the root in the carrier, metres.
+    pub hip: Vector3<f64>,
     pub hip_flexion: f64,
     /// Rotation of the whole leg about the body's forward axis against the vertical: positive carries the foot to the left.
     pub leg_lateral: f64,
-    pub hip_rotation: f64,
     pub knee: f64,
     pub ankle: f64,
     pub toe_out: f64,
@@ -54,7 +57,7 @@ pub(super) struct Angles {
 
 impl Angles {
     /// From one sample of the tracks; toe and lateral position of the legs are left at rest.
-    pub fn from_tracks(deg: &[f64; TRACKS]) -> Angles {
+    pub fn from_tracks(deg: &[f64; TRACKS], offsets: &[Vector3<f64>; NODES]) -> Angles {
         let get = |channel, side| deg[track(channel, side)].to_radians();
         let side = |s| Side {
             hip_flexion: get(Channel::HipFlexion, s),
@@ -66,7 +69,7 @@ impl Angles {
             elbow: above_zero(get(Channel::Elbow, s), 5f64.to_radians()),
             ..Side::default()
         };
-        Angles {
+        let mut angles = Angles {
             sides: [side(0), side(1)],
             tilt: get(Channel::Tilt, 0),
             list: get(Channel::List, 0),
@@ -74,7 +77,12 @@ impl Angles {
             lean: get(Channel::Lean, 0),
             bend: get(Channel::Bend, 0),
             torsion: get(Channel::Torsion, 0),
+        };
+        let carrier_from_root = angles.carrier_from_root();
+        for (side, names) in angles.sides.iter_mut().zip(&SIDES) {
+            side.hip = carrier_from_root * (offsets[Joint::Sacroiliac as usize] + offsets[names.hip as usize]);
         }
+        angles
     }
 
     pub fn carrier_from_root(&self) -> UnitQuaternion<f64> {
@@ -114,34 +122,30 @@ impl Angles {
     fn leg(&self, s: usize) -> [UnitQuaternion<f64>; 4] {
         let side = &self.sides[s];
         let sign = if s == 0 { 1.0 } else { -1.0 };
-        let carrier_from_thigh = list(side.leg_lateral) * pitch(self.tilt - side.hip_flexion) * yaw(-sign * side.hip_rotation);
+        let carrier_from_thigh = list(side.leg_lateral) * pitch(self.tilt - side.hip_flexion);
         let hip = self.carrier_from_root().inverse() * carrier_from_thigh;
         let ankle = list(-side.leg_lateral) * yaw(sign * side.toe_out) * pitch(-side.ankle);
         [hip, pitch(side.knee), ankle, pitch(-side.toe)]
     }
 
-    /// Sole points relative to the root, and the pitch of both feet (toes up positive).
-    pub fn soles(&self, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> (Soles, [f64; 2]) {
-        let mut soles = [[Vector3::zeros(); SOLE_POINTS]; 2];
-        let mut pitches = [0.0; 2];
-        for (s, names) in SIDES.iter().enumerate() {
-            let [hip, knee, ankle, toe] = self.leg(s);
-            let rotation = self.carrier_from_root();
-            let at_hip = rotation * (offsets[Joint::Sacroiliac as usize] + offsets[names.hip as usize]);
-            let rotation = rotation * hip;
-            let at_knee = at_hip + rotation * offsets[names.knee as usize];
-            let rotation = rotation * knee;
-            let at_ankle = at_knee + rotation * offsets[names.ankle as usize];
-            let rotation = rotation * ankle;
-            let at_ball = at_ankle + rotation * offsets[names.midtarsal as usize];
-            pitches[s] = (rotation * Vector3::z()).y.asin();
-            soles[s] = [
-                at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
-                at_ball + rotation * (Vector3::new(0.0, -BALL_HEIGHT, 0.0) * stature_m),
-                at_ball + rotation * toe * (Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD) * stature_m),
-            ];
-        }
-        (soles, pitches)
+    /// Sole points of one side relative to the root, and the foot's pitch (toes up positive).
+    pub fn sole(&self, s: usize, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> (Sole, f64) {
+        let (side, names) = (&self.sides[s], &SIDES[s]);
+        let sign = if s == 0 { 1.0 } else { -1.0 };
+        let (tilted, out) = (list(side.leg_lateral), yaw(sign * side.toe_out));
+        // The leg is flat up to the ankle, so angles add up.
+        let thigh = self.tilt - side.hip_flexion;
+        let bone = |length: f64, angle: f64| Vector3::new(0.0, -length * angle.cos(), -length * angle.sin());
+        let (knee, ankle) = (-offsets[names.knee as usize].y, -offsets[names.ankle as usize].y);
+        let at_ankle = side.hip + tilted * (bone(knee, thigh) + bone(ankle, thigh + side.knee));
+        let rotation = tilted * pitch(thigh + side.knee) * tilted.inverse() * out * pitch(-side.ankle);
+        let at_ball = at_ankle + rotation * offsets[names.midtarsal as usize];
+        let sole = [
+            at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
+            at_ball + rotation * (Vector3::new(0.0, -BALL_HEIGHT, 0.0) * stature_m),
+            at_ball + rotation * (pitch(-side.toe) * (Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD) * stature_m)),
+        ];
+        (sole, (rotation * Vector3::z()).y.asin())
     }
 }
 
@@ -200,15 +204,21 @@ const SIDES: [SideJoints; 2] = [
 ];
 
 fn pitch(angle: f64) -> UnitQuaternion<f64> {
-    exp(&Vector3::new(angle, 0.0, 0.0))
+    about(angle, |s| [s, 0.0, 0.0])
 }
 
 fn yaw(angle: f64) -> UnitQuaternion<f64> {
-    exp(&Vector3::new(0.0, angle, 0.0))
+    about(angle, |s| [0.0, s, 0.0])
 }
 
 fn list(angle: f64) -> UnitQuaternion<f64> {
-    exp(&Vector3::new(0.0, 0.0, angle))
+    about(angle, |s| [0.0, 0.0, s])
+}
+
+fn about(angle: f64, axis: impl Fn(f64) -> [f64; 3]) -> UnitQuaternion<f64> {
+    let (sin, cos) = (0.5 * angle).sin_cos();
+    let [x, y, z] = axis(sin);
+    UnitQuaternion::new_unchecked(Quaternion::new(cos, x, y, z))
 }
 
 /// Smooth maximum of `x` and 0 that rounds the corner over about `corner`: knees and elbows do not bend backwards.

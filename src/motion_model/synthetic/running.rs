@@ -97,12 +97,13 @@ pub(super) fn gait(speed: f64, rv: f64, cycle_s: f64) -> Gait {
         cycle_s,
         stride_m: speed * cycle_s,
         support,
-        leads: (0.0, support - 0.03),
+        leads: (0.05, support - 0.05),
         laid_flat: (0.0, 0.07),
         heel_rises: (0.45 * support, 0.70 * support),
         lets_go: (0.0, 0.15),
         bounces: true,
         sway,
+        clearance_m: 0.03,
         step_width: 0.4,
     }
 }

@@ -16,13 +16,14 @@ use crate::motion_model::cycle::{RootSample, SAMPLES};
 
 /// Harmonics kept of the root's path: fewer lose the dip at heel strike, more keep the jitter of changing contact points.
 const ROOT_HARMONICS: usize = 6;
+/// Share of the feet's own surging that the root follows: the published curves alone would halve the speed at heel
+/// strike, where people lose a tenth.
+const SURGE: f64 = 0.3;
 /// Weights of hip, knee and ankle in keeping the toes on the floor: more ankle leaves the foot standing on its tip.
 const WILLING: Vector3<f64> = Vector3::new(1.0, 1.5, 0.25);
 /// Shares of hip flexion, knee flexion and dorsiflexion in lifting a swinging foot.
-const LIFT: Vector3<f64> = Vector3::new(0.3, 0.6, 0.8);
+const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 1.0);
 const LIFT_HEEL: Vector3<f64> = Vector3::new(0.5, 1.0, 0.0);
-/// Height of the sole over the floor in mid swing, at least.
-const CLEARANCE_M: f64 = 0.012;
 /// How far the ankle stretches at push-off, radians.
 const PLANTARFLEXION_LIMIT: f64 = 0.55;
 /// How much lower than at take-off a runner lands at most.
@@ -48,6 +49,8 @@ pub(super) struct Gait {
     pub bounces: bool,
     /// Sway to the left in units of H.
     pub sway: fn(f64) -> f64,
+    /// Height of the sole over the floor in mid swing, at least; metres.
+    pub clearance_m: f64,
     /// Factor on the subject's step width in walking.
     pub step_width: f64,
 }
@@ -87,7 +90,7 @@ struct Path {
 
 /// Height and progress as the leading foot dictates, from its heel strike until its heel rises; in between smoothly on.
 fn leading_path(subject: &SyntheticSubject, gait: &Gait, angles: &[Angles]) -> Path {
-    let soles: Vec<Soles> = angles.iter().map(|a| subject.soles(a).0).collect();
+    let soles: Vec<Soles> = angles.iter().map(|a| [0, 1].map(|side| subject.sole(a, side).0)).collect();
     let leads = |t: f64| if (gait.leads.0..gait.leads.1).contains(&t) { 1.0 } else { 0.0 };
     let contact: Vec<_> = (0..SAMPLES).map(|i| [leads(own_phase(i, 0)), leads(own_phase(i, 1))]).collect();
     let bridged = |values: Vec<Option<f64>>| {
@@ -105,7 +108,7 @@ fn leading_path(subject: &SyntheticSubject, gait: &Gait, angles: &[Angles]) -> P
     }
     let stride_m: f64 = steps.iter().sum();
     let drift: Vec<_> = ahead_m.iter().enumerate().map(|(i, z)| z - stride_m * phase(i)).collect();
-    let ahead_m = low_pass(&drift, 3).iter().enumerate().map(|(i, z)| z + stride_m * phase(i)).collect();
+    let ahead_m = low_pass(&drift, 3).iter().enumerate().map(|(i, z)| SURGE * z + stride_m * phase(i)).collect();
     Path { height_m, ahead_m, stride_m }
 }
 
@@ -137,7 +140,7 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
     let at = |k: usize| (strike + k) % SAMPLES;
     let ahead = |k: usize| path.ahead_m[at(k)] + path.stride_m * ((strike + k) / SAMPLES) as f64;
     let flat: Vec<usize> = (0..SAMPLES).filter(|&k| (gait.laid_flat.1..gait.heel_rises.0).contains(&phase(k))).collect();
-    let toe_z = flat.iter().map(|&k| ahead(k) + subject.soles(&angles[at(k)]).0[side][2].z).sum::<f64>() / flat.len() as f64;
+    let toe_z = flat.iter().map(|&k| ahead(k) + subject.sole(&angles[at(k)], side).0[2].z).sum::<f64>() / flat.len() as f64;
     let turns: Vec<Vector3<f64>> = (0..=(gait.support * SAMPLES as f64) as usize)
         .map(|k| {
             let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
@@ -165,7 +168,7 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
     let miss = |v: &Vector2<f64>| {
         let mut angles = *angles;
         turn(&mut angles.sides[side], &of_hip_and_knee(v));
-        let [heel, ball, toe] = subject.soles(&angles).0[side];
+        let [heel, ball, toe] = subject.sole(&angles, side).0;
         let z = toe_share * toe.z + (1.0 - toe_share) * (heel.z + FOOT_LENGTH * subject.stature_m) - target[0];
         Vector2::new(z, heel.y.min(ball.y).min(toe.y) - target[1])
     };
@@ -197,7 +200,7 @@ fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, targe
         let mut angles = *angles;
         turn(&mut angles.sides[side], by);
         bend_toes(subject, &mut angles, side, gait.heel_rises.1.min(gait.support), gait);
-        let [_, ball, toe] = subject.soles(&angles).0[side];
+        let [_, ball, toe] = subject.sole(&angles, side).0;
         Vector2::new(toe.z - target[0], ball.y.min(toe.y) - target[1])
     };
     let mut by = Vector3::zeros();
@@ -223,14 +226,14 @@ fn turn(leg: &mut Side, by: &Vector3<f64>) {
 /// A swinging foot that would touch the floor is lifted by ankle, knee and hip.
 fn clear_floor(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: usize, gait: &Gait) {
     let lowest = |angles: &Angles| {
-        let [heel, ball, toe] = subject.soles(angles).0[side].map(|p| p.y);
-        // The heel comes down by itself at the end of the swing: dorsiflexion is for the rest of the foot.
-        if heel < ball.min(toe) { (heel + CLEARANCE_M, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
+        let [heel, ball, toe] = subject.sole(angles, side).0.map(|p| p.y);
+        // A walker's heel comes down by itself at the end of the swing; dorsiflexion is for the rest of the foot.
+        if heel < ball.min(toe) { (heel + if gait.bounces { 0.0 } else { gait.clearance_m }, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
     };
     for _ in 0..2 {
         let lift = |i: usize| {
             let swing = (own_phase(i, side) - gait.support - 0.04) / (0.99 - gait.support);
-            let wanted = CLEARANCE_M * (std::f64::consts::PI * swing.clamp(0.0, 1.0)).sin().sqrt();
+            let wanted = gait.clearance_m * (std::f64::consts::PI * swing.clamp(0.0, 1.0)).sin().sqrt();
             let (height, way) = lowest(&angles[i]);
             let lack = if (0.0..1.0).contains(&swing) { (wanted - path.height_m[i] - height).max(0.0) } else { 0.0 };
             let mut moved = angles[i];
@@ -241,8 +244,8 @@ fn clear_floor(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, s
         let lifts: Vec<_> = (0..SAMPLES).map(lift).collect();
         for (i, angles) in angles.iter_mut().enumerate() {
             // The widened maximum keeps the lift smooth and still enough where it is needed.
-            let widest = |i: usize| (0..=8).map(|k| lifts[(i + SAMPLES + k - 4) % SAMPLES]).fold(Vector3::zeros(), |a, b| a.sup(&b));
-            let smooth = (0..=8).map(|k| widest((i + SAMPLES + k - 4) % SAMPLES)).sum::<Vector3<f64>>() / 9.0;
+            let widest = |i: usize| (0..=6).map(|k| lifts[(i + SAMPLES + k - 3) % SAMPLES]).fold(Vector3::zeros(), |a, b| a.sup(&b));
+            let smooth = (0..=6).map(|k| widest((i + SAMPLES + k - 3) % SAMPLES)).sum::<Vector3<f64>>() / 7.0;
             turn(&mut angles.sides[side], &smooth);
         }
     }
@@ -267,18 +270,18 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -
             let hip = track(Channel::HipFlexion, side);
             sample[hip] = mean[hip] + gain * (sample[hip] - mean[hip]);
         }
-        let mut angles = Angles::from_tracks(&sample);
+        let mut angles = Angles::from_tracks(&sample, &subject.offsets);
         for side in 0..2 {
             let sign = if side == 0 { 1.0 } else { -1.0 };
             let adduction = sample[track(Channel::HipAdduction, side)] - mean[track(Channel::HipAdduction, side)];
             let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.3 * adduction.to_radians();
             for _ in 0..2 {
-                let [heel, _, toe] = subject.soles(&angles).0[side];
+                let [heel, _, toe] = subject.sole(&angles, side).0;
                 angles.sides[side].leg_lateral += foot_x - 0.5 * (heel.x + toe.x) / subject.hip_height_m;
             }
             let t = own_phase(i, side);
             let flat = smooth_step(gait.laid_flat.0, gait.laid_flat.1, t) * (1.0 - smooth_step(gait.heel_rises.0, gait.heel_rises.1, t));
-            angles.sides[side].ankle -= flat * subject.soles(&angles).1[side];
+            angles.sides[side].ankle -= flat * subject.sole(&angles, side).1;
             bend_toes(subject, &mut angles, side, t, gait);
         }
         angles
@@ -288,7 +291,7 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -
 
 /// Toes stay level while the heel is up, as far as they bend, and stretch after toe-off.
 fn bend_toes(subject: &SyntheticSubject, angles: &mut Angles, side: usize, t: f64, gait: &Gait) {
-    let heel_up = above_zero(-subject.soles(angles).1[side], 0.03);
+    let heel_up = above_zero(-subject.sole(angles, side).1, 0.03);
     let (rises, off) = (gait.heel_rises.0, gait.support);
     let standing = smooth_step(rises - 0.12, rises - 0.02, t) * (1.0 - smooth_step(off, off + 0.15, t));
     angles.sides[side].toe = standing * TOE_LIMIT * (heel_up / TOE_LIMIT).tanh();

@@ -71,7 +71,7 @@ fn hip(rv: f64, c: f64) -> [(f64, f64); 3] {
 /// (15 to 20 degrees at 15 % of the cycle, more when faster) and swing to 60 to 65.
 fn knee(rv: f64, c: f64) -> [(f64, f64); 4] {
     let load = (6.0 + 7.0 * rv).min(25.0);
-    let peak = if rv < 0.5 { 124.0 * rv } else { 62.0 + 3.0 * c };
+    let peak = if rv < 0.5 { 110.0 * rv } else { (51.0 + 8.0 * rv).min(66.0) };
     [(0.15 - 0.02 * c, load), (0.4, 5.0), (0.72 - 0.03 * c, peak), (1.0 - 0.02 * c, 3.0 + 5.0 * c)]
 }
 
@@ -110,9 +110,10 @@ pub(super) fn gait(speed: f64, cycle_s: f64) -> Gait {
         leads: (0.0, 0.40),
         laid_flat: (0.01, 0.09),
         heel_rises: (0.32, 0.46),
-        lets_go: (-0.09, 0.13),
+        lets_go: (-0.11, 0.09),
         bounces: false,
         sway,
+        clearance_m: 0.010,
         step_width: 1.0,
     }
 }
