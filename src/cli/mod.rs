@@ -1,6 +1,5 @@
 //! One file per subcommand: load, call the library, save, report.
 
-mod progress;
 mod disparity;
 mod generate;
 mod model;
@@ -39,10 +38,9 @@ pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
         Command::Disparity(args) => disparity::run(&args),
-        Command::Render(args) => render::run(&args),
-    }
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
+        Command::Render(args) => render::run(&args),
     }
 }
 

@@ -2,8 +2,8 @@
 
 pub mod asf_amc;
 pub mod atomic;
-pub mod joints_csv;
 pub mod fit_json;
+pub mod joints_csv;
 pub mod pfm;
 pub mod ply;
 

@@ -4,7 +4,6 @@ pub mod arrow;
 pub mod banded;
 pub mod curves;
 pub mod distance_field;
-pub mod curves;
 pub mod pca;
 pub mod rotation;
 pub mod spline;
