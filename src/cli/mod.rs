@@ -64,6 +64,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Render(args) => render::run(&args),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
+        Command::Render(args) => render::run(&args),
     }
 }
 

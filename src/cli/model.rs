@@ -12,6 +12,9 @@ use muybridge::style::validate::{Score, validate};
 
 use super::motions::{ActivityName, exclude, read_recordings};
 
+/// Components whose share of the variance is printed.
+const SHOWN_COMPONENTS: usize = 20;
+
 #[derive(Subcommand)]
 pub enum ModelCommand {
     /// Database and PCA from motion capture
@@ -136,7 +139,7 @@ fn description(path: &Path, model: &Model) -> String {
     );
     let counts = [0.90, 0.95, 0.99].map(|v| format!("{} components hold {v:.2}", model.components(v))).join(", ");
     let _ = writeln!(text, "  variance: {counts}");
-    let explained: Vec<String> = model.explained().iter().take(model.basis.ncols()).map(|e| format!("{e:.3}")).collect();
+    let explained: Vec<String> = model.explained().iter().take(SHOWN_COMPONENTS).map(|e| format!("{e:.3}")).collect();
     let _ = writeln!(text, "  explained by 1, 2, ...: {}", explained.join(" "));
     let law = model.cadence();
     let _ = writeln!(text, "  cadence: f = {:.3} V^{:.3} Hz, scatter of members {:.1} %", law.a, law.b, 100.0 * scatter(model));

@@ -16,9 +16,9 @@ pub enum StyleFileError {
 }
 
 pub fn read_style(path: &Path) -> Result<Style, StyleFileError> {
-    let text = std::fs::read_to_string(path).map_err(|cause| StyleFileError::Read { path: path.to_path_buf(), cause })?;
+    let bytes = std::fs::read(path).map_err(|cause| StyleFileError::Read { path: path.to_path_buf(), cause })?;
     let failed = |why: String| StyleFileError::Parse { path: path.to_path_buf(), why };
-    let style: Style = serde_json::from_str(&text).map_err(|e| failed(e.to_string()))?;
+    let style: Style = serde_json::from_slice(&bytes).map_err(|e| failed(e.to_string()))?;
     let positive = [style.hip_height_m, style.cadence_factor];
     if positive.iter().any(|v| !(v.is_finite() && *v > 0.0)) || !style.parameter.is_finite() {
         return Err(failed("parameter, hip_height_m and cadence_factor must be finite, the last two positive".into()));

@@ -138,7 +138,7 @@ mod tests {
             (vector[0], vector[7]) = (3.4, -1.7);
             model.project(&vector)
         };
-        assert!((found.weights - &expected.rows(0, 1)).norm() < 1e-9);
+        assert!((found.weights - expected.rows(0, 1)).norm() < 1e-9);
         assert!(found.notice.unwrap().contains("all 3 take part"));
     }
 
