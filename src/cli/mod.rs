@@ -1,7 +1,6 @@
 //! One file per subcommand: load, call the library, save, report.
-mod clouds;
-
 mod check;
+mod clouds;
 mod disparity;
 mod generate;
 mod model;
@@ -64,7 +63,6 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Render(args) => render::run(&args),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
-        Command::Render(args) => render::run(&args),
     }
 }
 

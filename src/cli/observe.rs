@@ -1,38 +1,16 @@
 //! A session's frames to what the fit looks at: clouds and silhouettes.
 
 use anyhow::{Context, Result, bail};
-use image::GrayImage;
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::Observation;
-use muybridge::footage::{FrameSet, foreground};
+use muybridge::footage::FrameSet;
 use muybridge::io::session::Session;
 use rayon::prelude::*;
 
 use super::progress;
 
-/// Frames whose median over time stands in for missing pictures of the empty stage.
-const STAGE_FRAMES: usize = 25;
 /// Frames that are in memory at once.
 const BATCH: usize = 8;
-
-/// Empty-stage pictures of a session, per camera: its own, or the median over time.
-pub fn stage_pictures(session: &Session) -> Result<Vec<GrayImage>> {
-    if let Some(pictures) = &session.backgrounds {
-        return Ok(pictures.clone());
-    }
-    eprintln!(
-        "note: no pictures of the empty stage (NAME_background.png); the median over time stands in, which needs a person who moves on"
-    );
-    let step = session.frame_count.div_ceil(STAGE_FRAMES).max(1);
-    let mut per_camera: Vec<Vec<GrayImage>> = vec![Vec::new(); session.rig.cameras.len()];
-    for frame in session.frames().step_by(step) {
-        for (pictures, image) in per_camera.iter_mut().zip(frame?.images) {
-            pictures.push(image);
-        }
-    }
-    let medians = per_camera.iter().map(|pictures| foreground::stage_from_frames(pictures));
-    medians.collect::<Option<_>>().context("the session has no frames to take the empty stage from")
-}
 
 /// Clouds of all frames; `each` sees every frame with its pictures, in order.
 pub fn observe(

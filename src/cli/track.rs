@@ -102,7 +102,7 @@ pub fn run(args: &TrackArgs) -> Result<()> {
 /// Clouds of a session and the fit to them.
 pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
     let cloud_options = CloudOptions::default();
-    let stage = observe::stage_pictures(session)?;
+    let stage = session.stages()?;
     let rig =
         CloudRig::new(&session.rig, Some(&stage), &cloud_options).with_context(|| format!("the rig of {}", session.folder.display()))?;
     let step = session.frame_count.div_ceil(STRIP).max(1);
