@@ -35,7 +35,7 @@ pub struct Recordings {
 
 /// Reads and cuts all entries of one activity; files that cannot be used are listed, the others go on.
 pub fn read_recordings(entries: &[Entry], activity: Activity) -> Recordings {
-    let read: Vec<Result<(Vec<Cycle>, Vec<String>), String>> = entries.par_iter().map(|e| cycles_of(e, activity)).collect();
+    let read: Vec<_> = entries.par_iter().map(|e| cycles_of(e, activity)).collect();
     let mut recordings = Recordings::default();
     for (entry, result) in entries.iter().zip(read) {
         match result {
