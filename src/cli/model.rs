@@ -90,10 +90,10 @@ fn build(args: BuildArgs) -> Result<()> {
     let activity = args.activity.into();
     let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
     let recordings = read_recordings(&entries, activity);
-    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     if recordings.cycles.is_empty() {
-        bail!("none of {} motions can be used for {activity}", entries.len());
+        bail!("none of {} motions can be used for {activity}{}", entries.len(), recordings.first_reason());
     }
+    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     let found = recordings.cycles.len();
     let (cycles, thinned) = database::thin(recordings.cycles);
     for t in &thinned {
