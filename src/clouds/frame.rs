@@ -8,6 +8,7 @@ use super::{tidy, triangulate};
 use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
 use image::{GrayImage, ImageBuffer, Luma};
+use nalgebra::Vector3;
 
 /// Room around what changed, px: the reach of the correlation windows and of the outline's blur.
 const MARGIN_PX: usize = 12;
@@ -66,6 +67,16 @@ pub struct CloudRig {
 }
 
 impl CloudRig {
+    /// Height of the floor along `up`, metres: the lowest strong level among the points of the empty stage. `None` without
+    /// a stage, or where no level gathers [`FLOOR_SHARE`] of its points.
+    pub fn floor_m(&self, up: &Vector3<f64>) -> Option<f64> {
+        let (rectification, stage) = self.groups.first()?;
+        let disparity = &stage.as_ref()?.views.first()?.disparity;
+        let known = disparity.enumerate_pixels().filter(|(u, v, d)| u % 4 == 0 && v % 4 == 0 && d.0[0] > 0.0);
+        let heights = known.map(|(u, v, d)| rectification.world_from_pixel(u.into(), v.into(), d.0[0].into()).dot(up));
+        lowest_level(heights.collect())
+    }
+
     /// `stage_images` has one picture of the empty stage per camera of the rig.
     pub fn new(rig: &Rig, stage_images: Option<&[GrayImage]>, options: &CloudOptions) -> Result<Self, CloudError> {
         let with_stage = |group: Rectification| {
@@ -88,6 +99,31 @@ impl CloudRig {
         }
         Ok(all)
     }
+}
+
+/// Half the thickness of a level, metres.
+const LEVEL_M: f64 = 0.02;
+/// Part of all points that a level must gather; furniture and walls spread over heights.
+const FLOOR_SHARE: f64 = 0.05;
+
+/// Centre of the lowest slab of ±[`LEVEL_M`] that holds [`FLOOR_SHARE`] of the values and more than the slab just above.
+fn lowest_level(mut heights: Vec<f64>) -> Option<f64> {
+    heights.sort_by(f64::total_cmp);
+    let within = |centre: f64| {
+        let from = heights.partition_point(|h| *h < centre - LEVEL_M);
+        let to = heights.partition_point(|h| *h <= centre + LEVEL_M);
+        &heights[from..to]
+    };
+    let enough = FLOOR_SHARE * heights.len() as f64;
+    let mut centre = *heights.first()?;
+    while centre < *heights.last()? {
+        if within(centre).len() as f64 >= enough && within(centre + LEVEL_M / 2.0).len() <= within(centre).len() {
+            let level = within(centre);
+            return Some(level[level.len() / 2]);
+        }
+        centre += LEVEL_M / 4.0;
+    }
+    None
 }
 
 impl Stage {
@@ -217,6 +253,18 @@ fn points(rectification: &Rectification, reference: &(PreparedView, ViewDisparit
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lowest_level_is_the_floor_under_a_table_and_between_walls() {
+        let noise = |i: usize| 0.008 * ((i * 7919 % 101) as f64 / 50.0 - 1.0);
+        let wall = (0..3000).map(|i| -0.3 + i as f64 * 1e-3);
+        let floor = (0..800).map(|i| 0.12 + noise(i));
+        let table = (0..900).map(|i| 0.7 + noise(i));
+        let level = lowest_level(wall.clone().chain(floor).chain(table).collect()).unwrap();
+        assert!((level - 0.12).abs() < 0.006, "{level}");
+        assert_eq!(lowest_level(wall.collect()), None);
+        assert_eq!(lowest_level(Vec::new()), None);
+    }
     use std::path::{Path, PathBuf};
 
     fn footage(name: &str) -> Option<PathBuf> {
