@@ -93,9 +93,9 @@ const SETTINGS: Settings = Settings {
     phase_acceleration: 1.35,
     tilt: 0.08,
     stature: 0.03,
-    length: 0.025,
-    arm_length: 0.05,
-    width: 0.08,
+    length: 0.018,
+    arm_length: 0.04,
+    width: 0.12,
 };
 
 /// Steadiness of the phase while the start is still rough.
