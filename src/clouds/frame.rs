@@ -328,7 +328,7 @@ mod tests {
     fn score(rig: &Rig, frame: &FrameCloud, folder: &Path, number: usize) -> [f64; 4] {
         let truth = grey(folder.join(format!("truth/mask_cam_00/{number:06}.png")));
         let depth = image::open(folder.join(format!("truth/depth_cam_00/{number:06}.png"))).unwrap().into_luma16();
-        let (wide, tight) = (super::super::masks::box_vote(&truth, 2, 0.0), super::super::masks::box_vote(&truth, 2, 0.999));
+        let (wide, tight) = (crate::footage::regions::box_vote(&truth, 2, 0.0), crate::footage::regions::box_vote(&truth, 2, 0.999));
         let mut covered = GrayImage::new(640, 480);
         let (mut errors, mut off) = (Vec::new(), 0.0);
         for point in &frame.cloud.points {
@@ -341,7 +341,7 @@ mod tests {
                 errors.push((rig.cameras[0].camera_point(&point.position).z - z).abs());
             }
         }
-        let covered = super::super::masks::box_vote(&covered, 1, 0.0);
+        let covered = crate::footage::regions::box_vote(&covered, 1, 0.0);
         let count = |f: &dyn Fn(bool, bool, bool) -> bool| {
             let mask = frame.masks[0].as_ref().unwrap();
             let all = truth.iter().zip(mask.iter()).zip(covered.iter());

@@ -8,9 +8,9 @@
 //! Fails where the person stays within [`StageOptions::clearance_m`] of the stage, and for mirrors and curtains.
 
 use super::correlate::Region;
-use super::masks;
 use super::prefilter::blur;
 use super::stereo::{PreparedView, StereoOptions, ViewDisparity, match_views};
+use crate::footage::regions;
 use crate::rig::rectify::{Plane, Rectification};
 use image::{GrayImage, Luma};
 
@@ -192,9 +192,9 @@ fn median(values: impl Iterator<Item = f32>, known: &[bool]) -> f32 {
 /// The box around the changed pieces of at least the smallest size, with a margin; `None` when there are none.
 pub(crate) fn changed_box(changed: &GrayImage, options: &StageOptions, margin: usize) -> Option<Region> {
     let (width, height) = (changed.width() as usize, changed.height() as usize);
-    let solid = masks::box_vote(changed, 1, 0.6);
+    let solid = regions::box_vote(changed, 1, 0.6);
     let mut found: Option<Region> = None;
-    for piece in masks::pieces(&solid, |v| v != 0).into_iter().filter(|p| p.len() >= options.smallest_piece_px) {
+    for piece in regions::pieces(&solid, false).into_iter().filter(|p| p.len() >= options.smallest_piece_px) {
         for i in piece {
             let (x, y) = (i % width, i / width);
             let b = found.get_or_insert(Region { x: [x, x], y: [y, y] });
@@ -229,9 +229,9 @@ pub(crate) fn person_mask(
     let (person, ground) = (density(Label::Person), density(Label::Stage));
     let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && person[i] > ground[i]);
     let mut mask = GrayImage::from_fn(width, height, |x, y| Luma([if set((y * width + x) as usize) { 255 } else { 0 }]));
-    mask = masks::box_vote(&mask, 1, 0.5);
-    masks::keep_large(&mut mask, options.smallest_piece_px);
-    masks::fill_holes(&mut mask, options.largest_hole_px);
+    mask = regions::box_vote(&mask, 1, 0.5);
+    mask = regions::keep_large(&mask, options.smallest_piece_px);
+    mask = regions::fill_holes(&mask, options.largest_hole_px);
     trim_outline(&mut mask, &changes[k].difference);
     mask
 }

@@ -118,11 +118,11 @@ fn walking_feet_stand_on_the_floor_and_do_not_slide() {
             let cycle = subject.cycle(kmh * KMH, 0);
             let placements = placements(&subject, &cycle);
             for (i, heights) in foot_heights(&subject, &cycle).iter().enumerate() {
-                for side in 0..2 {
+                for (side, &height) in heights.iter().enumerate() {
                     let t = phase_from_strike(i, side);
-                    assert!(heights[side] > -0.035, "{seed} at {kmh} side {side} phase {t}: {}", heights[side]);
+                    assert!(height > -0.035, "{seed} at {kmh} side {side} phase {t}: {height}");
                     if (0.02..0.48).contains(&t) {
-                        assert!(heights[side].abs() < 0.025, "{seed} at {kmh} side {side} phase {t}: {}", heights[side]);
+                        assert!(height.abs() < 0.025, "{seed} at {kmh} side {side} phase {t}: {height}");
                     }
                     if (0.15..0.45).contains(&t) && i + 1 < SAMPLES {
                         let toe = |i: usize| sole(&subject, &placements[i], side)[2];
@@ -183,10 +183,10 @@ fn running_has_flight_under_gravity_and_stance_on_the_floor() {
             for (i, low) in heights.iter().enumerate() {
                 assert!(low[0].min(low[1]) > -0.035, "{seed} at {kmh} {i}: {low:?}");
                 aloft += usize::from(low[0] > 0.01 && low[1] > 0.01);
-                for side in 0..2 {
+                for (side, &height) in low.iter().enumerate() {
                     let t = phase_from_strike(i, side);
                     if (0.03..support - 0.03).contains(&t) {
-                        assert!(low[side].abs() < 0.03, "{seed} at {kmh} side {side} phase {t}: {}", low[side]);
+                        assert!(height.abs() < 0.03, "{seed} at {kmh} side {side} phase {t}: {height}");
                     }
                 }
                 if (i..i + 3).all(|k| !stands(k % SAMPLES, 0) && !stands(k % SAMPLES, 1)) {
@@ -223,7 +223,7 @@ fn jumps_fly_under_gravity_and_cover_their_length() {
             let step_s = cycle.duration_s / SAMPLES as f64;
             let heights = foot_heights(&subject, &cycle);
             let mut flown = 0;
-            for i in 0..SAMPLES - 2 {
+            for (i, lowest) in heights.iter().enumerate().take(SAMPLES - 2) {
                 let s = i as f64 * step_s;
                 let p = [0, 1, 2].map(|k| cycle.root[i + k].position * h);
                 if s >= off && s + 2.0 * step_s <= land {
@@ -232,7 +232,7 @@ fn jumps_fly_under_gravity_and_cover_their_length() {
                     flown += 1;
                 }
                 let mid_flight = s > off + 0.3 * (land - off) && s < off + 0.7 * (land - off);
-                for low in heights[i] {
+                for &low in lowest {
                     assert!(low > -0.02, "{seed} {length} {i}: {low}");
                     assert!(if mid_flight { low > 0.03 } else { s > off && s < land || low < 0.03 }, "{seed} {length} {i}: {low}");
                 }
@@ -332,8 +332,10 @@ fn the_walking_law_gives_the_published_figures() {
     assert!((average.duration_s * walking::frequency_hz(average.parameter / average.hip_height_m) - 1.0).abs() < 0.2);
 }
 
-/// Rows of the reference table: channel, speed, coefficients a0 a1 b1 a2 b2 …, spread between people in degrees.
-fn reference(dataset: &str) -> Option<Vec<(String, f64, Vec<f64>, f64)>> {
+/// Channel, speed, coefficients a0 a1 b1 a2 b2 …, spread between people in degrees.
+type ReferenceRow = (String, f64, Vec<f64>, f64);
+
+fn reference(dataset: &str) -> Option<Vec<ReferenceRow>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/reference/gait_fourier.csv");
     let Ok(text) = std::fs::read_to_string(&path) else {
         println!("skipped: no {}", path.display());
