@@ -19,13 +19,17 @@ const ROOT_HARMONICS: usize = 6;
 /// Share of the feet's own surging that the root follows: the published curves alone would halve the speed at heel
 /// strike, where people lose a tenth.
 const SURGE: f64 = 0.3;
+/// Long strides of walkers reach back more than forward: shift of the hip, degrees per unit of gain.
+const FARTHER_BACK_DEG: f64 = 5.0;
 /// Weights of hip, knee and ankle in keeping the toes on the floor: more ankle leaves the foot standing on its tip.
 const WILLING: Vector3<f64> = Vector3::new(1.0, 1.5, 0.25);
 /// Shares of hip flexion, knee flexion and dorsiflexion in lifting a swinging foot.
-const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 1.0);
+const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 0.50);
 const LIFT_HEEL: Vector3<f64> = Vector3::new(0.5, 1.0, 0.0);
 /// How far the ankle stretches at push-off, radians.
 const PLANTARFLEXION_LIMIT: f64 = 0.55;
+/// Where the iterations that place a foot stop.
+const CLOSE_ENOUGH_M: f64 = 1e-4;
 /// How much lower than at take-off a runner lands at most.
 const MOST_DROP_M: f64 = 0.05;
 /// A leg that carries does not stretch beyond this, radians.
@@ -61,7 +65,7 @@ pub(super) fn cycle(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait) ->
     let mut gain = 1.0;
     let mut angles = angles(subject, tracks, gait, gain);
     let mut path = leading_path(subject, gait, &angles);
-    for _ in 0..3 {
+    for _ in 0..2 {
         gain *= (gait.stride_m / path.stride_m).clamp(0.5, 2.0);
         angles = self::angles(subject, tracks, gait, gain);
         path = leading_path(subject, gait, &angles);
@@ -150,6 +154,10 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
             hold.lerp(&stand, rise)
         })
         .collect();
+    // A stretched leg and a bent one may both do: the change from one to the other takes a few samples.
+    let around = |k: usize| (0..=4).map(move |j| ((k + j).saturating_sub(2), [1.0, 2.0, 3.0, 2.0, 1.0][j]));
+    let turns: Vec<Vector3<f64>> =
+        (0..turns.len()).map(|k| around(k).map(|(j, w)| turns[j.min(turns.len() - 1)] * (w / 9.0)).sum()).collect();
     let (first, last) = (turns[0], turns[turns.len() - 1]);
     for k in 0..SAMPLES {
         let t = phase(k);
@@ -175,6 +183,9 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
     let mut v = Vector2::zeros();
     for _ in 0..6 {
         let here = miss(&v);
+        if here.x.abs() < CLOSE_ENOUGH_M && (!gait.bounces || here.y.abs() < CLOSE_ENOUGH_M) {
+            break;
+        }
         let by_hip = (miss(&(v + Vector2::x() * 1e-4)) - here) / 1e-4;
         let most = KNEE_LIMIT - angles.sides[side].knee;
         let mut step = Vector2::new(here.x / by_hip.x.max(0.3 * subject.hip_height_m), 0.0);
@@ -193,19 +204,22 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
     of_hip_and_knee(&v)
 }
 
-/// Turns of hip, knee and ankle with the smallest weighted norm that put the toe tip at `target` z, and the lower of ball
-/// and toe tip at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher.
+/// Turns of hip, knee and ankle with the smallest weighted norm that put the toe tip at `target` z, and the lowest sole
+/// point at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher.
 fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
     let miss = |by: &Vector3<f64>| {
         let mut angles = *angles;
         turn(&mut angles.sides[side], by);
         bend_toes(subject, &mut angles, side, gait.heel_rises.1.min(gait.support), gait);
-        let [_, ball, toe] = subject.sole(&angles, side).0;
-        Vector2::new(toe.z - target[0], ball.y.min(toe.y) - target[1])
+        let [heel, ball, toe] = subject.sole(&angles, side).0;
+        Vector2::new(toe.z - target[0], heel.y.min(ball.y).min(toe.y) - target[1])
     };
     let mut by = Vector3::zeros();
     for _ in 0..8 {
         let here = miss(&by);
+        if here.norm() < CLOSE_ENOUGH_M {
+            break;
+        }
         let jacobian = Matrix2x3::from_columns(&[0, 1, 2].map(|k| (miss(&(by + Vector3::ith(k, 1e-4))) - here) / 1e-4));
         let spread = jacobian * Matrix3::from_diagonal(&WILLING);
         let Some(inverse) = (spread * jacobian.transpose() + Matrix2::identity() * 1e-4).try_inverse() else { break };
@@ -227,8 +241,8 @@ fn turn(leg: &mut Side, by: &Vector3<f64>) {
 fn clear_floor(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: usize, gait: &Gait) {
     let lowest = |angles: &Angles| {
         let [heel, ball, toe] = subject.sole(angles, side).0.map(|p| p.y);
-        // A walker's heel comes down by itself at the end of the swing; dorsiflexion is for the rest of the foot.
-        if heel < ball.min(toe) { (heel + if gait.bounces { 0.0 } else { gait.clearance_m }, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
+        // A walker's heel comes down by itself at the end of the swing, and dorsiflexion would only lower it.
+        if gait.bounces && heel < ball.min(toe) { (heel, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
     };
     for _ in 0..2 {
         let lift = |i: usize| {
@@ -268,13 +282,15 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -
         let mut sample = *sample;
         for side in 0..2 {
             let hip = track(Channel::HipFlexion, side);
-            sample[hip] = mean[hip] + gain * (sample[hip] - mean[hip]);
+            sample[hip] = mean[hip] + gain * (sample[hip] - mean[hip]) - if gait.bounces { 0.0 } else { FARTHER_BACK_DEG * (gain - 1.0) };
         }
         let mut angles = Angles::from_tracks(&sample, &subject.offsets);
         for side in 0..2 {
             let sign = if side == 0 { 1.0 } else { -1.0 };
+            // A standing foot does not turn.
+            angles.sides[side].toe_out = -mean[track(Channel::HipRotation, side)].to_radians();
             let adduction = sample[track(Channel::HipAdduction, side)] - mean[track(Channel::HipAdduction, side)];
-            let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.3 * adduction.to_radians();
+            let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.1 * adduction.to_radians();
             for _ in 0..2 {
                 let [heel, _, toe] = subject.sole(&angles, side).0;
                 angles.sides[side].leg_lateral += foot_x - 0.5 * (heel.x + toe.x) / subject.hip_height_m;
