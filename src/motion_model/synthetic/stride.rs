@@ -15,7 +15,7 @@ use crate::math::rotation::log;
 use crate::motion_model::cycle::{RootSample, SAMPLES};
 
 /// Harmonics kept of the root's path: fewer lose the dip at heel strike, more keep the jitter of changing contact points.
-const ROOT_HARMONICS: usize = 6;
+const ROOT_HARMONICS: usize = 8;
 /// Share of the feet's own surging that the root follows: the published curves alone would halve the speed at heel
 /// strike, where people lose a tenth.
 const SURGE: f64 = 0.3;
@@ -28,6 +28,8 @@ const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 0.50);
 const LIFT_HEEL: Vector3<f64> = Vector3::new(0.5, 1.0, 0.0);
 /// How far the ankle stretches at push-off, radians.
 const PLANTARFLEXION_LIMIT: f64 = 0.55;
+/// How deep a walker's foot may sink into the floor before the knee gives: less makes straight knees jerk.
+const SINKS_M: f64 = 0.008;
 /// Where the iterations that place a foot stop.
 const CLOSE_ENOUGH_M: f64 = 1e-4;
 /// How much lower than at take-off a runner lands at most.
@@ -145,19 +147,15 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
     let ahead = |k: usize| path.ahead_m[at(k)] + path.stride_m * ((strike + k) / SAMPLES) as f64;
     let flat: Vec<usize> = (0..SAMPLES).filter(|&k| (gait.laid_flat.1..gait.heel_rises.0).contains(&phase(k))).collect();
     let toe_z = flat.iter().map(|&k| ahead(k) + subject.sole(&angles[at(k)], side).0[2].z).sum::<f64>() / flat.len() as f64;
-    let turns: Vec<Vector3<f64>> = (0..=(gait.support * SAMPLES as f64) as usize)
-        .map(|k| {
-            let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
-            let target = [toe_z - ahead(k), -path.height_m[at(k)]];
-            let hold = hold_flat(subject, &angles[at(k)], side, phase(k), target, gait);
-            let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait) } else { hold };
-            hold.lerp(&stand, rise)
-        })
-        .collect();
-    // A stretched leg and a bent one may both do: the change from one to the other takes a few samples.
-    let around = |k: usize| (0..=4).map(move |j| ((k + j).saturating_sub(2), [1.0, 2.0, 3.0, 2.0, 1.0][j]));
-    let turns: Vec<Vector3<f64>> =
-        (0..turns.len()).map(|k| around(k).map(|(j, w)| turns[j.min(turns.len() - 1)] * (w / 9.0)).sum()).collect();
+    let correction = |k: usize| {
+        let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
+        let target = [toe_z - ahead(k), -path.height_m[at(k)]];
+        let hold = hold_flat(subject, &angles[at(k)], side, phase(k), target, gait);
+        let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait) } else { hold };
+        hold.lerp(&stand, rise)
+    };
+    let turns: Vec<_> = (0..=(gait.support * SAMPLES as f64) as usize).map(correction).collect();
+    let turns = smoothed(&turns);
     let (first, last) = (turns[0], turns[turns.len() - 1]);
     for k in 0..SAMPLES {
         let t = phase(k);
@@ -168,7 +166,15 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
     }
 }
 
-/// Turn of the hip (and of the knee in running, whose root moves by its own law), undone at the ankle, that puts the toe
+/// Mean over seven neighbours, near ones more: a stretched leg and a bent one may both reach, and the change from one to the
+/// other takes time.
+fn smoothed(turns: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
+    let weights = [1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0];
+    let at = |k: usize| turns[k.saturating_sub(3).min(turns.len() - 1)];
+    (0..turns.len()).map(|k| weights.iter().enumerate().map(|(j, w)| at(k + j) * (w / 16.0)).sum()).collect()
+}
+
+/// Turn of the hip (and of the knee, as far as the root's path asks for it), undone at the ankle, that puts the toe
 /// tip at `target` z, or the heel where it must be for that, and the lowest sole point at its y.
 fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
     let toe_share = smooth_step(0.03, 0.12, t);
@@ -178,18 +184,21 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
         turn(&mut angles.sides[side], &of_hip_and_knee(v));
         let [heel, ball, toe] = subject.sole(&angles, side).0;
         let z = toe_share * toe.z + (1.0 - toe_share) * (heel.z + FOOT_LENGTH * subject.stature_m) - target[0];
-        Vector2::new(z, heel.y.min(ball.y).min(toe.y) - target[1])
+        let sinks_m = if gait.bounces { 0.0 } else { SINKS_M };
+        Vector2::new(z, heel.y.min(ball.y).min(toe.y) + sinks_m - target[1])
     };
     let mut v = Vector2::zeros();
     for _ in 0..6 {
         let here = miss(&v);
-        if here.x.abs() < CLOSE_ENOUGH_M && (!gait.bounces || here.y.abs() < CLOSE_ENOUGH_M) {
+        // A walker's root follows the leg: the knee only gives where the foot would sink deep.
+        let knee_gives = gait.bounces || here.y < 0.0 || v.y > 0.0;
+        if here.x.abs() < CLOSE_ENOUGH_M && (!knee_gives || here.y.abs() < CLOSE_ENOUGH_M) {
             break;
         }
         let by_hip = (miss(&(v + Vector2::x() * 1e-4)) - here) / 1e-4;
-        let most = KNEE_LIMIT - angles.sides[side].knee;
+        let most = if gait.bounces { KNEE_LIMIT - angles.sides[side].knee } else { 0.0 };
         let mut step = Vector2::new(here.x / by_hip.x.max(0.3 * subject.hip_height_m), 0.0);
-        if gait.bounces {
+        if knee_gives {
             let by_knee = (miss(&(v + Vector2::y() * 1e-4)) - here) / 1e-4;
             let jacobian = Matrix2::from_columns(&[by_hip, by_knee]);
             let normal = jacobian.transpose() * jacobian + Matrix2::identity() * 1e-4;

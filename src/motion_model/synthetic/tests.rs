@@ -104,7 +104,7 @@ fn rotations_are_continuous_and_cycles_close() {
                     assert!(step_deg < most_deg, "{activity:?} {} {} joint {k} sample {i}: {step_deg}", cycle.subject, cycle.parameter);
                 }
                 let step = cycle.root[(i + 1) % SAMPLES].position - cycle.root[i].position;
-                assert!(step.norm() < 0.06, "{activity:?} {} root {i}: {step:?}", cycle.subject);
+                assert!(step.norm() < 0.08, "{activity:?} {} root {i}: {step:?}", cycle.subject);
             }
         }
     }
@@ -117,21 +117,23 @@ fn walking_feet_stand_on_the_floor_and_do_not_slide() {
         for kmh in [3.0, 5.0, 7.0] {
             let cycle = subject.cycle(kmh * KMH, 0);
             let placements = placements(&subject, &cycle);
+            let mut slides = Vec::new();
             for (i, heights) in foot_heights(&subject, &cycle).iter().enumerate() {
-                for side in 0..2 {
+                for (side, &height) in heights.iter().enumerate() {
                     let t = phase_from_strike(i, side);
-                    assert!(heights[side] > -0.04, "{seed} at {kmh} side {side} phase {t}: {}", heights[side]);
+                    assert!(height > -0.03, "{seed} at {kmh} side {side} phase {t}: {height}");
                     if (0.02..0.48).contains(&t) {
-                        assert!(heights[side].abs() < 0.04, "{seed} at {kmh} side {side} phase {t}: {}", heights[side]);
+                        assert!(height.abs() < 0.03, "{seed} at {kmh} side {side} phase {t}: {height}");
                     }
-                    if (0.15..0.45).contains(&t) && i + 1 < SAMPLES {
+                    if (0.12..0.45).contains(&t) && i + 1 < SAMPLES {
                         let toe = |i: usize| sole(&subject, &placements[i], side)[2];
                         let slide = (toe(i + 1) - toe(i)) * SAMPLES as f64 / cycle.duration_s;
-                        let share = slide.xz().norm() / cycle.parameter;
-                        assert!(share < 0.15, "{seed} at {kmh} side {side} phase {t}: slides at {share} of the speed");
+                        slides.push(slide.xz().norm() / cycle.parameter);
                     }
                 }
             }
+            let (mean, most) = (slides.iter().sum::<f64>() / slides.len() as f64, range(&slides).1);
+            assert!(mean < 0.08 && most < 0.30, "{seed} at {kmh}: slides at {mean} of the speed, at most {most}");
         }
     }
 }
@@ -185,10 +187,10 @@ fn running_has_flight_under_gravity_and_stance_on_the_floor() {
                 // Slow runners hardly rise.
                 let clear = if kmh < 8.0 { 0.004 } else { 0.01 };
                 aloft += usize::from(low[0] > clear && low[1] > clear);
-                for side in 0..2 {
+                for (side, low) in low.iter().enumerate() {
                     let t = phase_from_strike(i, side);
                     if (0.03..support - 0.03).contains(&t) {
-                        assert!(low[side].abs() < 0.04, "{seed} at {kmh} side {side} phase {t}: {}", low[side]);
+                        assert!(low.abs() < 0.04, "{seed} at {kmh} side {side} phase {t}: {low}");
                     }
                 }
                 if (i..i + 3).all(|k| !stands(k % SAMPLES, 0) && !stands(k % SAMPLES, 1)) {
@@ -199,7 +201,7 @@ fn running_has_flight_under_gravity_and_stance_on_the_floor() {
             // Two flights per cycle, each 0.5 − support of it.
             let share = aloft as f64 / SAMPLES as f64;
             let flight = 2.0 * (0.5 - support);
-            assert!(share > 0.3 * flight && share < flight + 0.1, "{seed} at {kmh}: {share} aloft, flight {flight}");
+            assert!(share > 0.3 * flight && share < flight + 0.15, "{seed} at {kmh}: {share} aloft, flight {flight}");
         }
     }
 }
@@ -225,7 +227,7 @@ fn jumps_fly_under_gravity_and_cover_their_length() {
             let step_s = cycle.duration_s / SAMPLES as f64;
             let heights = foot_heights(&subject, &cycle);
             let mut flown = 0;
-            for i in 0..SAMPLES - 2 {
+            for (i, low) in heights.iter().enumerate().take(SAMPLES - 2) {
                 let s = i as f64 * step_s;
                 let p = [0, 1, 2].map(|k| cycle.root[i + k].position * h);
                 if s >= off && s + 2.0 * step_s <= land {
@@ -234,7 +236,7 @@ fn jumps_fly_under_gravity_and_cover_their_length() {
                     flown += 1;
                 }
                 let mid_flight = s > off + 0.3 * (land - off) && s < off + 0.7 * (land - off);
-                for low in heights[i] {
+                for &low in low {
                     assert!(low > -0.02, "{seed} {length} {i}: {low}");
                     assert!(if mid_flight { low > 0.03 } else { s > off && s < land || low < 0.03 }, "{seed} {length} {i}: {low}");
                 }
@@ -334,8 +336,10 @@ fn the_walking_law_gives_the_published_figures() {
     assert!((average.duration_s * walking::frequency_hz(average.parameter / average.hip_height_m) - 1.0).abs() < 0.2);
 }
 
-/// Rows of the reference table: channel, speed, coefficients a0 a1 b1 a2 b2 …, spread between people in degrees.
-fn reference(dataset: &str) -> Option<Vec<(String, f64, Vec<f64>, f64)>> {
+/// Row of the reference table: channel, speed, coefficients a0 a1 b1 a2 b2 …, spread between people in degrees.
+type Row = (String, f64, Vec<f64>, f64);
+
+fn reference(dataset: &str) -> Option<Vec<Row>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/reference/gait_fourier.csv");
     let Ok(text) = std::fs::read_to_string(&path) else {
         println!("skipped: no {}", path.display());
@@ -395,7 +399,7 @@ fn mean_walkers_lie_within_the_spread_of_people() {
         // Their hip angle is measured against the pelvis' own plane, tilted forward by this much in standing.
         let tilt = row("pelvis_ant_tilt", beta).2[0];
         for (ours, (channel, offset, most)) in
-            ours.iter().zip([("hip_flexion", tilt, 0.8), ("knee_flexion", 0.0, 1.25), ("ankle_dorsiflexion", 0.0, 1.35)])
+            ours.iter().zip([("hip_flexion", tilt, 0.8), ("knee_flexion", 0.0, 1.35), ("ankle_dorsiflexion", 0.0, 1.35)])
         {
             let (_, _, coefficients, spread) = row(channel, beta);
             let (rms, largest) = deviation(ours, |t| series(coefficients, t) - offset);
