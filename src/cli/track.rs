@@ -114,9 +114,10 @@ pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Res
         index += 1;
         Ok(())
     })?;
+    let options = FitOptions { floor_m: rig.floor_m(&session.rig.up.direction()), ..*options };
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
-    let fit = fit::fit(&observations, &session.rig, &model.model, options, &|_, share| {
+    let fit = fit::fit(&observations, &session.rig, &model.model, &options, &|_, share| {
         let percent = (100.0 * share) as u64;
         bar.inc(percent.saturating_sub(done.replace(percent)));
     })

@@ -58,6 +58,9 @@ pub struct Stage {
 #[derive(Clone, Debug)]
 pub(crate) struct StageView {
     pub plane: Plane,
+    /// As matched, px; NaN where nothing was found.
+    pub matched: Plane,
+    /// The same with its gaps filled.
     pub disparity: Plane,
 }
 
@@ -68,7 +71,11 @@ impl Stage {
             (0..images.len()).map(|k| PreparedView::new(rectification.warp(k, images[k]), rectification.views[k].step)).collect();
         let regions = vec![whole(rectification); prepared.len()];
         let found = match_views(&prepared, &regions, [0, largest_px], options);
-        let views = prepared.into_iter().zip(found).map(|(p, f)| StageView { plane: p.plane, disparity: fill_gaps(&f.disparity) });
+        let views = prepared.into_iter().zip(found).map(|(p, f)| StageView {
+            plane: p.plane,
+            disparity: fill_gaps(&f.disparity),
+            matched: f.disparity,
+        });
         Self { views: views.collect() }
     }
 }
