@@ -326,7 +326,7 @@ fn cycles_of_one_person_are_closer_than_people() {
 
 #[test]
 fn the_walking_law_gives_the_published_figures() {
-    // algorithms.md 3.1: H = 0.884 m at 3, 5 and 7 km/h.
+    // The published frequency at H = 0.884 m and 3, 5 and 7 km/h.
     for (kmh, hz, stride_m) in [(3.0, 0.72, 1.16), (5.0, 0.93, 1.49), (7.0, 1.10, 1.76)] {
         let f = walking::frequency_hz(kmh * KMH / 0.884);
         assert!((f - hz).abs() < 0.006 && (kmh * KMH / f - stride_m).abs() < 0.01, "{kmh}: {f}");

@@ -1,5 +1,5 @@
 //! Parametric walk after Boulic, Magnenat-Thalmann and Thalmann (1990), "A global human walking model with real-time
-//! kinematic personification", The Visual Computer 6: 344-358; algorithms.md 3.1 and 3.6.
+//! kinematic personification", The Visual Computer 6: 344-358.
 //!
 //! Relative velocity RV = v/H (1/s), cycle frequency f = 0.743 √RV, support share of the cycle 0.752 − 0.143 f. Angles are
 //! functions of the phase t from the side's own heel strike and of RV, through control points.
