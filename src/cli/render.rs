@@ -140,7 +140,7 @@ pub fn write_session(folder: &Path, take: &Take) -> Result<()> {
 }
 
 /// Temporary folders are the owner's alone.
-fn make_readable(folder: &Path) -> Result<()> {
+pub(super) fn make_readable(folder: &Path) -> Result<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
