@@ -20,27 +20,47 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     let (session, notices) = Session::open(&args.session, args.fps)?;
     print_session(&session);
     notices.iter().for_each(|notice| println!("notice: {notice}"));
+    let found = look(&session)?;
+    print_survey(&session, &found.seen);
+    println!("\ndistance of common corners from their epipolar lines, median");
+    found.still.iter().zip(&found.moving).for_each(|(still, moving)| print_pair(&session, still, moving));
+    let warnings = found.warnings(&session);
+    println!();
+    warnings.iter().for_each(|warning| println!("warning: {warning}"));
+    println!("{}", if warnings.is_empty() { "ready" } else { "usable, with these warnings" });
+    Ok(())
+}
+
+/// What a look at all frames found.
+pub struct Findings {
+    seen: Survey,
+    still: Vec<PairResidual>,
+    moving: Vec<PairResidual>,
+}
+
+impl Findings {
+    /// What the user should know, one sentence each.
+    pub fn warnings(&self, session: &Session) -> Vec<String> {
+        [self.seen.warnings(&session.rig), residual_warnings(&session.rig, &self.still, &self.moving)].concat()
+    }
+}
+
+/// Looks at all frames of a session; an error where nobody is in view.
+pub fn look(session: &Session) -> Result<Findings> {
     session.rig.validate_stereo()?;
     let stages = session.stages()?;
     let bar = progress::bar("frames", session.frame_count as u64);
     let seen = survey(session.frames().inspect(|_| bar.inc(1)), session.frame_count, &stages)?;
     bar.finish();
-    print_survey(&session, &seen);
     ensure!(
         seen.somebody_in_view(),
         "{}: no person in view: no picture differs from the empty stage; film somebody, or give pictures of the stage without them (cam_NN_background.png)",
-        args.session.display()
+        session.folder.display()
     );
     let still = epipolar_residuals(&session.rig, &[&stages], None);
     let (frames, masks): (Vec<_>, Vec<_>) = seen.samples.iter().map(|(frame, masks)| (frame.images.as_slice(), masks.clone())).unzip();
     let moving = epipolar_residuals(&session.rig, &frames, Some(&masks));
-    println!("\ndistance of common corners from their epipolar lines, median");
-    still.iter().zip(&moving).for_each(|(still, moving)| print_pair(&session, still, moving));
-    let warnings = [seen.warnings(&session.rig), residual_warnings(&session.rig, &still, &moving)].concat();
-    println!();
-    warnings.iter().for_each(|warning| println!("warning: {warning}"));
-    println!("{}", if warnings.is_empty() { "ready" } else { "usable, with these warnings" });
-    Ok(())
+    Ok(Findings { seen, still, moving })
 }
 
 fn print_session(session: &Session) {

@@ -1,6 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod check;
 mod clouds;
+mod demo;
 mod disparity;
 mod generate;
 mod model;
@@ -26,6 +27,8 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// The whole main job on footage of a phantom, with its errors against the known truth
+    Demo(demo::DemoArgs),
     /// What is wrong with a session and what to do, before any long work
     Check(check::CheckArgs),
     /// The person's point cloud in every frame of a session, as PLY files
@@ -57,6 +60,7 @@ pub fn silence_opencv() {
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
     match cli.command {
+        Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),

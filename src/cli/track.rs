@@ -6,8 +6,9 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use image::GrayImage;
 use muybridge::body::{Clip, NODES, Placement, Pose, place};
-use muybridge::clouds::{CloudOptions, CloudRig};
+use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::{self, Fit, FitOptions, Observation};
+use muybridge::footage::FrameSet;
 use muybridge::io::{bvh, fit_json, joints_csv, model_npz, session::Session, style_json};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom;
@@ -101,20 +102,38 @@ pub fn run(args: &TrackArgs) -> Result<()> {
 
 /// Clouds of a session and the fit to them.
 pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
+    fit_to(session, look(session, |_, _, _| Ok(()))?, model, options)
+}
+
+/// What the cameras saw in all frames.
+pub struct Seen {
+    observations: Vec<Observation>,
+    pictures: Vec<(usize, GrayImage)>,
+    floor_m: Option<f64>,
+}
+
+/// Clouds of a session; `each` sees every frame, in order.
+pub fn look(session: &Session, mut each: impl FnMut(&CloudRig, &FrameSet, &FrameCloud) -> Result<()>) -> Result<Seen> {
     let cloud_options = CloudOptions::default();
     let stage = session.stages()?;
     let rig =
         CloudRig::new(&session.rig, Some(&stage), &cloud_options).with_context(|| format!("the rig of {}", session.folder.display()))?;
     let step = session.frame_count.div_ceil(STRIP).max(1);
     let (mut pictures, mut index) = (Vec::new(), 0);
-    let observations = observe::observe(session, &rig, &cloud_options, |frame, _| {
+    let observations = observe::observe(session, &rig, &cloud_options, |frame, found| {
         if index % step == 0 {
             pictures.extend(frame.images.first().map(|image| (index, image.clone())));
         }
         index += 1;
-        Ok(())
+        each(&rig, frame, found)
     })?;
-    let options = FitOptions { floor_m: rig.floor_m(&session.rig.up.direction()), ..*options };
+    Ok(Seen { observations, pictures, floor_m: rig.floor_m(&session.rig.up.direction()) })
+}
+
+/// The fit to what was seen of a session.
+pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
+    let Seen { observations, pictures, floor_m } = seen;
+    let options = FitOptions { floor_m, ..*options };
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
     let fit = fit::fit(&observations, &session.rig, &model.model, &options, &|_, share| {

@@ -28,7 +28,7 @@ pub fn publish(partial: TempDir, folder: &Path) -> Result<()> {
 }
 
 /// Temporary folders are the owner's alone.
-fn make_readable(folder: &Path) -> Result<()> {
+pub fn make_readable(folder: &Path) -> Result<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;

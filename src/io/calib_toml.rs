@@ -37,7 +37,12 @@ pub enum CalibError {
 /// Reads a rig and refuses it where [`Rig::validate`] does.
 pub fn read_rig(path: &Path) -> Result<Rig, CalibError> {
     let text = std::fs::read_to_string(path).map_err(|error| CalibError::Read { path: path.into(), error })?;
-    let tables: Table = text.parse().map_err(|e| syntax_error(path, &text, &e))?;
+    parse_rig(&text, path)
+}
+
+/// The same from text; `path` is what messages call it.
+pub fn parse_rig(text: &str, path: &Path) -> Result<Rig, CalibError> {
+    let tables: Table = text.parse().map_err(|e| syntax_error(path, text, &e))?;
     let up = read_up(path, &tables)?;
     let mut named: Vec<(&String, &Table)> =
         tables.iter().filter(|(name, _)| *name != "metadata").filter_map(|(name, value)| Some((name, value.as_table()?))).collect();

@@ -2,4 +2,4 @@
 
 pub mod playback;
 
-pub use playback::{Length, Synthesis, play, synthesize};
+pub use playback::{Length, Synthesis, play, play_cycle, synthesize};

@@ -9,11 +9,11 @@
 //! A jump's progress is scaled so that it ends at the wanted length.
 //! Checked against the wanted speed, the law's frequency, and a cycle of the database played at its own speed.
 
-use nalgebra::{DVector, Vector3};
+use nalgebra::{DVector, UnitQuaternion, Vector3};
 
-use crate::body::{Clip, NODES, Pose};
+use crate::body::{BALL_JOINTS, Clip, NODES, Pose};
 use crate::math::rotation::exp;
-use crate::motion_model::{Model, RootSample};
+use crate::motion_model::{Cycle, Model, RootSample};
 use crate::style::{Metric, Population, Style, StyleError, extrapolate};
 
 /// A jump's progress is only stretched by factors in this range: beyond, the weights describe another kind of jump.
@@ -60,22 +60,58 @@ pub fn synthesize(
 /// Plays at `fps` from the start of a cycle; `offsets` are those of the body that moves.
 pub fn play(model: &Model, synthesis: &Synthesis, offsets: &[Vector3<f64>; NODES], fps: f64, length: Length) -> Clip {
     let cyclic = model.activity.is_cyclic();
-    let seconds = match length {
-        Length::Cycles(n) if cyclic => n as f64 / synthesis.frequency_hz,
-        Length::Seconds(s) => s,
-        Length::Cycles(_) => 1.0 / synthesis.frequency_hz,
+    let ride = Ride {
+        cyclic,
+        parameter: synthesis.parameter,
+        hip_height_m: synthesis.hip_height_m,
+        frequency_hz: synthesis.frequency_hz,
+        stretch: if cyclic { 1.0 } else { stretch(model, synthesis) },
     };
-    let stretch = if cyclic { 1.0 } else { stretch(model, synthesis) };
-    let frames = (seconds * fps).round() as usize + 1;
-    let poses = (0..frames)
-        .map(|frame| {
-            let time_s = frame as f64 / fps;
-            let (joints, root) = model.posture(synthesis.weights.as_slice(), time_s * synthesis.frequency_hz);
-            let travelled_m = if cyclic { synthesis.parameter * time_s } else { 0.0 };
-            Pose { root: root_position(&root, synthesis.hip_height_m, travelled_m, stretch), world_from_root: exp(&root.rotation), joints }
-        })
-        .collect();
-    Clip { fps, poses, offsets: *offsets, hip_height_m: synthesis.hip_height_m }
+    ride.clip(&|phase| model.posture(synthesis.weights.as_slice(), phase), offsets, fps, length)
+}
+
+/// Plays a recorded cycle as it is, over and over where it is a gait's.
+pub fn play_cycle(cycle: &Cycle, offsets: &[Vector3<f64>; NODES], fps: f64, length: Length) -> Clip {
+    let ride = Ride {
+        cyclic: cycle.activity.is_cyclic(),
+        parameter: cycle.parameter,
+        hip_height_m: cycle.hip_height_m,
+        frequency_hz: 1.0 / cycle.duration_s,
+        stretch: 1.0,
+    };
+    ride.clip(&|phase| cycle.posture(phase), offsets, fps, length)
+}
+
+/// How a cycle is carried through time and space.
+struct Ride {
+    cyclic: bool,
+    parameter: f64,
+    hip_height_m: f64,
+    frequency_hz: f64,
+    stretch: f64,
+}
+
+type Posture<'a> = &'a dyn Fn(f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample);
+
+impl Ride {
+    fn clip(&self, posture: Posture, offsets: &[Vector3<f64>; NODES], fps: f64, length: Length) -> Clip {
+        let seconds = match length {
+            Length::Cycles(n) if self.cyclic => n as f64 / self.frequency_hz,
+            Length::Seconds(s) => s,
+            Length::Cycles(_) => 1.0 / self.frequency_hz,
+        };
+        let frames = (seconds * fps).round() as usize + 1;
+        let poses = (0..frames)
+            .map(|frame| {
+                let time_s = frame as f64 / fps;
+                let (joints, root) = posture(time_s * self.frequency_hz);
+                let travelled_m = if self.cyclic { self.parameter * time_s } else { 0.0 };
+                let at = root_position(&root, self.hip_height_m, travelled_m, self.stretch);
+                Pose { root: at, world_from_root: exp(&root.rotation), joints }
+            })
+            .collect();
+        Clip { fps, poses, offsets: *offsets, hip_height_m: self.hip_height_m }
+    }
 }
 
 fn root_position(root: &RootSample, hip_height_m: f64, travelled_m: f64, stretch: f64) -> Vector3<f64> {
@@ -154,6 +190,31 @@ mod tests {
             let (k, part) = (at as usize, at - at.floor());
             let knee = expected.joints[k][6].slerp(&expected.joints[(k + 1) % 100][6], part);
             assert!(pose.joints[6].angle_to(&knee) < 1e-3);
+        }
+    }
+
+    #[test]
+    fn a_recorded_cycle_is_played_as_its_own_model_would_play_it() {
+        let cycle = synthetic::subject(Activity::Walking, 7).cycle(1.3, 2);
+        let model =
+            Model::build(Activity::Walking, true, &[cycle.clone(), synthetic::subject(Activity::Walking, 8).cycle(1.3, 2)]).unwrap();
+        let weights = model.project(&model.vector_of(&cycle));
+        let synthesis = Synthesis {
+            weights,
+            parameter: 1.3,
+            hip_height_m: cycle.hip_height_m,
+            frequency_hz: 1.0 / cycle.duration_s,
+            shares: Vec::new(),
+            notice: None,
+        };
+        let offsets = Shape::template(1.7).offsets();
+        let played = play_cycle(&cycle, &offsets, 70.0, Length::Cycles(2));
+        let expected = play(&model, &synthesis, &offsets, 70.0, Length::Cycles(2));
+        assert_eq!(played.poses.len(), expected.poses.len());
+        for (a, b) in played.poses.iter().zip(&expected.poses) {
+            // Slerp and interpolated rotation vectors differ between samples; a quarter of a sample's motion would not pass.
+            assert!((a.root - b.root).norm() < 1e-4 && a.world_from_root.angle_to(&b.world_from_root) < 1e-3);
+            assert!(a.joints.iter().zip(&b.joints).all(|(a, b)| a.angle_to(b) < 2e-3));
         }
     }
 }

@@ -4,6 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::body::BALL_JOINTS;
+use crate::math::rotation::{exp, log};
 
 /// Samples per cycle, N of the paper, at phases 0, 1/N, …
 pub const SAMPLES: usize = 100;
@@ -62,4 +63,30 @@ pub struct Cycle {
     pub joints: Vec<[UnitQuaternion<f64>; BALL_JOINTS]>,
     /// [`SAMPLES`] root samples.
     pub root: Vec<RootSample>,
+}
+
+impl Cycle {
+    /// Joint rotations (index `joint as usize - 1`) and root at `phase`, by slerp between the neighbouring samples; a gait's
+    /// phase wraps, a jump's is held at its ends.
+    pub fn posture(&self, phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
+        let (before, after, part) = neighbours(self.activity, phase);
+        let turn = |a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>| a * exp(&(log(&(a.inverse() * b)) * part));
+        let (joints, root) = ((&self.joints[before], &self.joints[after]), (&self.root[before], &self.root[after]));
+        let rotation = log(&turn(&exp(&root.0.rotation), &exp(&root.1.rotation)));
+        let position = root.0.position.lerp(&root.1.position, part);
+        (std::array::from_fn(|j| turn(&joints.0[j], &joints.1[j])), RootSample { rotation, position })
+    }
+}
+
+/// Samples before and after a phase, and how far it is between them.
+pub(super) fn neighbours(activity: Activity, phase: f64) -> (usize, usize, f64) {
+    if activity.is_cyclic() {
+        let at = phase.rem_euclid(1.0) * SAMPLES as f64;
+        let before = at as usize % SAMPLES;
+        (before, (before + 1) % SAMPLES, at - at.floor())
+    } else {
+        let at = phase.clamp(0.0, 1.0) * (SAMPLES - 1) as f64;
+        let before = (at as usize).min(SAMPLES - 2);
+        (before, before + 1, at - before as f64)
+    }
 }

@@ -11,7 +11,7 @@ use nalgebra::{DMatrix, DVector, DVectorView, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
 use super::cadence::CadenceLaw;
-use super::cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
+use super::cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES, neighbours};
 use crate::body::{BALL_JOINTS, DOF};
 use crate::math::pca::{self, Pca, pca};
 use crate::math::rotation::{exp, log, mean};
@@ -291,19 +291,6 @@ fn combine_rows(mean: &DVector<f64>, basis: &DMatrix<f64>, weights: &[f64], firs
         sum.axpy(*w, &basis.column(i).rows(first, count), 1.0);
     }
     sum
-}
-
-/// Samples before and after a phase, and how far it is between them.
-fn neighbours(activity: Activity, phase: f64) -> (usize, usize, f64) {
-    if activity.is_cyclic() {
-        let at = phase.rem_euclid(1.0) * SAMPLES as f64;
-        let before = at as usize % SAMPLES;
-        (before, (before + 1) % SAMPLES, at - at.floor())
-    } else {
-        let at = phase.clamp(0.0, 1.0) * (SAMPLES - 1) as f64;
-        let before = (at as usize).min(SAMPLES - 2);
-        (before, before + 1, at - before as f64)
-    }
 }
 
 fn rotations(means: &[UnitQuaternion<f64>; BALL_JOINTS], coordinates: DVectorView<f64>) -> [UnitQuaternion<f64>; BALL_JOINTS] {

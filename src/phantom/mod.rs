@@ -5,7 +5,9 @@ pub mod noise;
 pub mod scene;
 pub mod stage;
 pub mod staging;
+pub mod truth;
 
 pub use figure::Figure;
 pub use scene::{DepthMap, Scene, View, depth, mask, render, render_stage, silhouette};
 pub use stage::Stage;
+pub use truth::{JointErrors, distance_to_skin, joint_errors};

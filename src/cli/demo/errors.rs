@@ -1,0 +1,146 @@
+//! Errors of everything that was recovered and generated.
+
+use anyhow::{Result, bail};
+use muybridge::body::{Pose, PosedSurface, Surface, place};
+use muybridge::math::rotation::exp;
+use muybridge::motion_model::synthetic::REPEATS;
+use muybridge::motion_model::{Cycle, Model, SAMPLES};
+use muybridge::phantom::truth::{ANGLES, JointErrors, Positions, distance_to_skin, joint_errors};
+use muybridge::style::{Metric, Population, Style};
+use nalgebra::{DVector, Vector3};
+use rayon::prelude::*;
+
+use super::table::Row;
+use super::{Generated, SPEED_M_S, Truth, at_speed};
+use crate::cli::track::{NamedModel, Tracked};
+
+/// Points of one frame whose distance to the skin is measured.
+const POINTS: usize = 2000;
+/// A point farther from the skin is none of the body's, metres.
+const OFF_BODY_M: f64 = 0.05;
+
+pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
+    let mut rows = cloud_rows(truth, tracked)?;
+    rows.extend(joint_rows(truth, tracked));
+    rows.extend(motion_rows(truth, tracked));
+    rows.extend(weight_rows(truth, model, tracked));
+    rows.extend(speed_rows(truth, model, tracked, generated)?);
+    Ok(rows)
+}
+
+fn cloud_rows(truth: &Truth, tracked: &Tracked) -> Result<Vec<Row>> {
+    let shape = truth.subject.shape();
+    let (surface, offsets) = (Surface::new(&shape), shape.offsets());
+    let frames: Vec<_> = tracked.observations.iter().zip(&truth.poses).collect();
+    let distances: Vec<Vec<f64>> = frames
+        .par_iter()
+        .map(|(seen, pose)| {
+            let skin = PosedSurface::new(&surface, &place(&offsets, pose));
+            let points = &seen.cloud.points;
+            points.iter().step_by(points.len().div_ceil(POINTS).max(1)).map(|p| distance_to_skin(&skin, &p.position)).collect()
+        })
+        .collect();
+    let mut all = distances.concat();
+    all.sort_by(f64::total_cmp);
+    let Some(median) = all.get(all.len() / 2) else { bail!("the clouds of the demo are empty") };
+    let off = all.iter().filter(|d| **d > OFF_BODY_M).count() as f64 / all.len() as f64;
+    let count = tracked.observations.iter().map(|o| o.cloud.points.len()).sum::<usize>() / tracked.observations.len().max(1);
+    Ok(vec![
+        Row::new("cloud to true skin, median", 1e3 * median, "mm").beside("points per frame", count as f64),
+        Row::new("cloud points over 50 mm off the body", 100.0 * off, "%"),
+    ])
+}
+
+fn joint_rows(truth: &Truth, tracked: &Tracked) -> Vec<Row> {
+    let positions = |poses: &[Pose], offsets: &Positions| -> Vec<Positions> { poses.iter().map(|p| place(offsets, p).positions).collect() };
+    let found = positions(&tracked.fit.poses, &tracked.fit.shape().offsets());
+    let errors = joint_errors(&found, &positions(&truth.poses, &truth.subject.shape().offsets()));
+    let mut rows = vec![
+        Row::new("joints, absolute", 1e3 * errors.absolute_m, "mm"),
+        Row::new("joints, pelvis moved together", 1e3 * errors.root_relative_m, "mm"),
+    ];
+    rows.extend(ANGLES.iter().zip(errors.angles).map(|((name, _), angle)| Row::new(format!("{name} angle"), angle.to_degrees(), "deg")));
+    rows.push(Row::new("legs, error with sides exchanged over own", errors.swapped_over_straight, ""));
+    rows
+}
+
+fn motion_rows(truth: &Truth, tracked: &Tracked) -> Vec<Row> {
+    let fit = &tracked.fit;
+    let wrapped = |d: f64| (d + 0.5).rem_euclid(1.0) - 0.5;
+    let phases = fit.state.carriers.iter().zip(&truth.phases).map(|(found, phase)| wrapped(found.phase - phase).abs());
+    let phase = phases.sum::<f64>() / truth.phases.len() as f64;
+    let frequency_hz = 1.0 / truth.cycle.duration_s;
+    vec![
+        Row::new("phase", phase, "cycle"),
+        Row::new("speed", 100.0 * (fit.speed_m_s / SPEED_M_S - 1.0).abs(), "%").beside("true m/s", SPEED_M_S),
+        Row::new("cadence", 100.0 * (fit.cadence_hz / frequency_hz - 1.0).abs(), "%").beside("true cycles/s", frequency_hz),
+        Row::new("stature", 1e3 * (fit.shape().stature_m - truth.subject.stature_m).abs(), "mm").beside("true m", truth.subject.stature_m),
+    ]
+}
+
+/// Distances of equation (6) of the style paper.
+fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row> {
+    let model = &model.model;
+    let found = DVector::from_column_slice(&tracked.fit.state.weights);
+    let population = Population::new(model, found.len());
+    let weights = |cycle: &Cycle| model.project(&model.vector_of(cycle)).rows(0, population.components()).into_owned();
+    let distance = |a: &DVector<f64>, b: &DVector<f64>| Metric::Paper.distance(&population.eigenvalues, a, b);
+    let own = weights(&truth.cycle);
+    let repeats: Vec<_> = (0..REPEATS).map(|r| weights(&truth.subject.cycle(SPEED_M_S, r))).collect();
+    let pairs: Vec<f64> =
+        (0..repeats.len()).flat_map(|i| (0..i).map(move |k| (i, k))).map(|(i, k)| distance(&repeats[i], &repeats[k])).collect();
+    let people: Vec<f64> = population.distances(&own, SPEED_M_S, Metric::Paper).into_iter().map(|n| n.distance).collect();
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+    vec![
+        Row::new("weights, equation (6)", distance(&found, &own), "")
+            .beside("between own cycles", mean(&pairs))
+            .beside("to other people", mean(&people)),
+    ]
+}
+
+/// The generated cycles against the subject's own true motion at those speeds, on the true body.
+fn speed_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
+    let found = &tracked.fit.state.weights;
+    let cycle_of = |weights: &[f64]| model.model.cycle(weights, "", SPEED_M_S, 1.0, 1.0);
+    let true_style = Style::of_cycles(&model.model, &model.hash, std::slice::from_ref(&truth.cycle));
+    let mut rows = Vec::new();
+    for motion in generated {
+        let speed_m_s = motion.kmh / 3.6;
+        let wanted = truth.subject.mean_cycle(speed_m_s);
+        let of = |cycle: &Cycle| against(truth, cycle, &wanted);
+        let made = of(&cycle_of(motion.synthesis.weights.as_slice()));
+        let unchanged = of(&cycle_of(found));
+        let average = of(&cycle_of(average_person(&model.model, found.len(), speed_m_s).as_slice()));
+        let mut angle = Row::new(format!("at {} km/h, angles", motion.kmh), made.angle().to_degrees(), "deg")
+            .beside("filmed motion unchanged", unchanged.angle().to_degrees())
+            .beside("average person", average.angle().to_degrees());
+        let mut joints = Row::new(format!("at {} km/h, joints, pelvis moved together", motion.kmh), 1e3 * made.root_relative_m, "mm")
+            .beside("filmed motion unchanged", 1e3 * unchanged.root_relative_m)
+            .beside("average person", 1e3 * average.root_relative_m);
+        if let Some(style) = &true_style {
+            let ideal = of(&cycle_of(at_speed(model, style, speed_m_s)?.weights.as_slice()));
+            angle = angle.beside("from the true style", ideal.angle().to_degrees());
+            joints = joints.beside("from the true style", 1e3 * ideal.root_relative_m);
+        }
+        let cadence = 100.0 * (motion.synthesis.frequency_hz * wanted.duration_s - 1.0).abs();
+        rows.extend([angle, joints, Row::new(format!("at {} km/h, cadence", motion.kmh), cadence, "%")]);
+    }
+    Ok(rows)
+}
+
+/// Mean of the database's people at a speed.
+fn average_person(model: &Model, components: usize, speed_m_s: f64) -> DVector<f64> {
+    let population = Population::new(model, components);
+    let sum: DVector<f64> = population.curves.iter().map(|c| population.extended(c, speed_m_s)).sum();
+    sum / population.curves.len() as f64
+}
+
+/// Both cycles on the true body, sample by sample from the right heel strike.
+fn against(truth: &Truth, found: &Cycle, wanted: &Cycle) -> JointErrors {
+    let offsets = truth.subject.shape().offsets();
+    let placed = |cycle: &Cycle| -> Vec<Positions> {
+        let pose = |k: usize| Pose { root: Vector3::zeros(), world_from_root: exp(&cycle.root[k].rotation), joints: cycle.joints[k] };
+        (0..SAMPLES).map(|k| place(&offsets, &pose(k)).positions).collect()
+    };
+    joint_errors(&placed(found), &placed(wanted))
+}
