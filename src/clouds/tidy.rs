@@ -5,6 +5,7 @@
 //! cloud of few points must not excuse its own outliers).
 
 use super::cloud::{Cloud, CloudPoint};
+use crate::math::order::quantile;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use std::collections::BTreeMap;
 use std::num::NonZero;
@@ -54,9 +55,8 @@ pub fn thin(cloud: Cloud, voxel_m: f64) -> Cloud {
     Cloud { points: kept.into_iter().map(|i| cloud.points[i].clone()).collect() }
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+fn median(values: Vec<f64>) -> f64 {
+    quantile(values, 0.5).unwrap_or(0.0)
 }
 
 #[cfg(test)]

@@ -9,6 +9,7 @@
 //! (few matches) and for residuals beyond the band. Checked on rendered footage with cameras right and turned by hand.
 
 use super::foreground::box_mean;
+use crate::math::order::quantile;
 use crate::rig::{Camera, Rig};
 use image::GrayImage;
 use nalgebra::{Point2, Vector2};
@@ -50,9 +51,8 @@ pub fn epipolar_residuals(rig: &Rig, sets: &[&[GrayImage]], masks: Option<&[Vec<
             }
             _ => Vec::new(),
         };
-        let mut distances: Vec<f64> = sets.iter().enumerate().flat_map(of_set).map(f64::abs).collect();
-        distances.sort_unstable_by(f64::total_cmp);
-        PairResidual { first, second, matches: distances.len(), median_px: distances.get(distances.len() / 2).copied() }
+        let distances: Vec<f64> = sets.iter().enumerate().flat_map(of_set).map(f64::abs).collect();
+        PairResidual { first, second, matches: distances.len(), median_px: quantile(distances, 0.5) }
     };
     rig.baselines_m().into_iter().map(pair).collect()
 }

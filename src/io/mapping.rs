@@ -17,6 +17,7 @@
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::body::{Clip, Joint, Length, NODES, Pose, Shape, place};
+use crate::math::order::quantile;
 use crate::math::rotation::between;
 
 /// Faster hips are a broken recording, m/s: sprinters reach 12.
@@ -126,17 +127,11 @@ fn level_floor(clip: &mut Clip) -> Option<f64> {
 
 /// Moves the clip so that the floor under its soles is y = 0.
 pub(crate) fn put_on_floor(clip: &mut Clip) {
-    let mut soles: Vec<f64> = clip.poses.iter().map(|pose| clip.sole_height(pose)).collect();
-    let floor = quantile(&mut soles, FLOOR_QUANTILE);
+    let soles: Vec<f64> = clip.poses.iter().map(|pose| clip.sole_height(pose)).collect();
+    let floor = quantile(soles, FLOOR_QUANTILE).unwrap_or(0.0);
     for pose in &mut clip.poses {
         pose.root.y -= floor;
     }
-}
-
-/// The value below which a share `q` of `values` lies; 0 for none.
-pub(crate) fn quantile(values: &mut [f64], q: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get((q * values.len() as f64) as usize).or(values.last()).copied().unwrap_or(0.0)
 }
 
 /// Frame rates written with few digits (0.00833333 s) meant whole numbers; 23.976 stays.
@@ -370,7 +365,7 @@ fn first_frame(recording: &Recording, anatomy: &Anatomy) -> usize {
         anatomy.of.iter().flatten().map(angle).fold(0.0, f64::max)
     };
     let steps: Vec<f64> = recording.frames.windows(2).map(step).collect();
-    let usual = quantile(&mut steps.clone(), 0.95);
+    let usual = quantile(steps.clone(), 0.95).unwrap_or(0.0);
     match steps.first() {
         Some(&first) if steps.len() > 20 && first > 10f64.to_radians() && first > 2.5 * usual => {
             steps.iter().take_while(|&&s| s > usual).count()

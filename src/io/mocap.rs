@@ -60,9 +60,9 @@ fn ending(path: &Path) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::mapping::quantile;
     use super::*;
     use crate::body::{Joint, Placement};
+    use crate::math::order::quantile;
     use crate::math::rotation::log;
     use nalgebra::Vector3;
     use std::collections::BTreeMap;
@@ -142,8 +142,8 @@ mod tests {
                 assert!((hips - theirs).xz().norm() < 1e-9, "{}", path.display());
             }
             // Upright hips stand as high as the straight leg says; none of this uses the recorded floor.
-            let mut heights: Vec<f64> = clip.poses.iter().map(|p| clip.place(p).position(Joint::LHip).y).collect();
-            let high = quantile(&mut heights, 0.95) / clip.hip_height_m;
+            let heights: Vec<f64> = clip.poses.iter().map(|p| clip.place(p).position(Joint::LHip).y).collect();
+            let high = quantile(heights, 0.95).unwrap() / clip.hip_height_m;
             assert!((0.92..1.06).contains(&high), "{}: {high}", path.display());
             let knee: Vec<f64> = clip.poses.iter().map(|p| log(p.joint(Joint::RKnee)).x.to_degrees()).collect();
             let hip: Vec<f64> = clip.poses.iter().map(|p| log(p.joint(Joint::LHip)).x).collect();

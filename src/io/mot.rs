@@ -11,8 +11,9 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::mapping::{quantile, tidy_fps};
+use super::mapping::tidy_fps;
 use crate::body::{Clip, Joint, Pose, Shape};
+use crate::math::order::quantile;
 use crate::math::rotation::exp;
 
 #[derive(Debug, thiserror::Error)]
@@ -259,7 +260,7 @@ fn stature_of(poses: &[Pose], origins: &[Vector3<f64>]) -> Result<f64, String> {
         placed.root = pose.world_from_root * root_from_origin(1.0);
         origin.y / -clip.sole_height(&placed)
     };
-    let stature = quantile(&mut poses.iter().zip(origins).map(ratio).collect::<Vec<f64>>(), 0.2);
+    let stature = quantile(poses.iter().zip(origins).map(ratio).collect(), 0.2).unwrap_or(0.0);
     if (0.8..2.5).contains(&stature) {
         return Ok(stature);
     }

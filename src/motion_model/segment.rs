@@ -25,6 +25,7 @@ use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use super::cadence::CadenceLaw;
 use super::cycle::{Activity, Cycle, RootSample, SAMPLES};
 use crate::body::{BALL_JOINTS, Clip, Joint, Pose, place};
+use crate::math::order::quantile;
 use crate::math::rotation::{exp, log};
 
 /// Heel behind and below the ankle, as fractions of the hip height: enough to see the swing end at the heel.
@@ -253,11 +254,10 @@ fn strides(track: &Track) -> Result<Vec<Stride>, SegmentError> {
 /// Median speed of the root over half seconds, m/s.
 fn travel_speed(track: &Track) -> f64 {
     let step = track.frames(0.5).clamp(1, track.poses.len() - 1);
-    let mut speeds: Vec<f64> = (0..track.poses.len() - step)
+    let speeds = (0..track.poses.len() - step)
         .map(|i| ground(&(track.poses[i + step].root - track.poses[i].root)).norm() * track.fps / step as f64)
         .collect();
-    speeds.sort_by(f64::total_cmp);
-    speeds[speeds.len() / 2]
+    quantile(speeds, 0.5).unwrap_or(0.0)
 }
 
 /// Heel strikes of the right (0) or left (1) foot in frames, with fractions.
@@ -294,9 +294,8 @@ fn smooth(x: &[f64], sigma: f64) -> Vec<f64> {
 
 /// Places of the maxima that stand out by [`PEAK_DROP`] of the range, to parts of a sample by a parabola.
 fn maxima(x: &[f64]) -> Vec<f64> {
-    let mut sorted = x.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let drop = PEAK_DROP * (sorted[sorted.len() * 95 / 100] - sorted[sorted.len() * 5 / 100]);
+    let [low, high] = [0.05, 0.95].map(|q| quantile(x.to_vec(), q).unwrap_or(0.0));
+    let drop = PEAK_DROP * (high - low);
     // A maximum in the first frames is one when the signal still rose to it.
     let (mut found, mut rising, mut best) = (Vec::new(), true, 0);
     for i in 0..x.len() {
@@ -472,9 +471,7 @@ fn horizontal_speed(track: &Track, frame: usize) -> f64 {
 /// Frames during which both ankles are up in the air.
 fn flights(track: &Track) -> Vec<Range<usize>> {
     let lower: Vec<f64> = (0..track.poses.len()).map(|i| track.ankles[0][i].y.min(track.ankles[1][i].y)).collect();
-    let mut sorted = lower.clone();
-    sorted.sort_by(f64::total_cmp);
-    let ground_m = sorted[sorted.len() / 10];
+    let ground_m = quantile(lower.clone(), 0.1).unwrap_or(0.0);
     let up = |i: usize| lower[i] > ground_m + FLIGHT_RISE * track.hip_height_m;
     let mut found = Vec::new();
     let mut i = 0;
