@@ -5,6 +5,9 @@
 //! weights of a PCA motion model ([`fit`], [`motion_model`]). The weights are the person's style ([`style`]); with them the
 //! same person walks, runs or jumps at speeds and lengths never filmed ([`motion`]).
 //!
+//! The "style paper" of the modules' texts is R. Urtasun, P. Glardon, R. Boulic, D. Thalmann and P. Fua, "Style-Based Motion
+//! Synthesis", Computer Graphics Forum 23(4), 2004.
+//!
 //! # Conventions
 //!
 //! - SI units and radians inside; any other unit is a suffix (`focal_px`, `angle_deg`). `io` converts.

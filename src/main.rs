@@ -7,8 +7,34 @@ fn main() -> std::process::ExitCode {
     match cli::run(cli::Cli::parse()) {
         Ok(()) => std::process::ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {}", sentence(&error));
             std::process::ExitCode::FAILURE
         }
+    }
+}
+
+/// The error with its causes on one line; a cause that the text before it tells already is not told again.
+fn sentence(error: &anyhow::Error) -> String {
+    let mut told = String::new();
+    for cause in error.chain() {
+        let text = cause.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
+        if !told.contains(&text) {
+            told += if told.is_empty() { "" } else { ": " };
+            told += &text;
+        }
+    }
+    told
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn causes_are_told_once_and_on_one_line() {
+        let io = std::io::Error::other("no\n  space");
+        let error = anyhow::Error::new(io).context("cannot write a: no space").context("walk");
+        assert_eq!(sentence(&error), "walk: cannot write a: no space");
+        assert_eq!(sentence(&anyhow::anyhow!("inner").context("outer")), "outer: inner");
     }
 }

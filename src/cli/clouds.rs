@@ -1,6 +1,6 @@
 //! `muybridge clouds`: a session's point clouds as PLY files.
 
-use super::observe::observe;
+use super::{observe::observe, whole};
 use anyhow::{Context, Result, bail};
 use muybridge::clouds::{CloudOptions, CloudRig};
 use muybridge::io::ply::write_ply;
@@ -35,13 +35,15 @@ pub fn run(args: &CloudsArgs) -> Result<()> {
     notices.iter().for_each(|notice| eprintln!("note: {notice}"));
     let stage = session.stages()?;
     let rig = CloudRig::new(&session.rig, Some(&stage), &options).with_context(|| format!("the rig of {}", args.session.display()))?;
+    let partial = whole::beside(&args.output)?;
     let (mut points, mut seen) = (0, 0);
     observe(&session, &rig, &options, |frame, found| {
-        write_ply(&args.output.join(format!("{:06}.ply", frame.number)), &found.cloud)?;
+        write_ply(&partial.path().join(format!("{:06}.ply", frame.number)), &found.cloud)?;
         points += found.cloud.points.len();
         seen += usize::from(!found.cloud.points.is_empty());
         Ok(())
     })?;
+    whole::publish(partial, &args.output)?;
     println!(
         "{seen} of {} frames with a person, {} points per frame, in {}",
         session.frame_count,

@@ -110,10 +110,10 @@ fn style_of_motion(args: &GenerateArgs, model: &Model, hash: &str) -> Result<Sty
         entries.iter_mut().for_each(|e| e.parameter = Some(recorded));
     }
     let recordings = read_recordings(&entries, model.activity);
-    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     let Some(style) = Style::of_cycles(model, hash, &recordings.cycles) else {
-        bail!("{} shows no whole cycle of {}", args.style.display(), model.activity);
+        bail!("{} shows no whole cycle of {}{}", args.style.display(), model.activity, recordings.first_reason());
     };
+    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     println!("style: {} cycles at {:.2}, nearest subject {}", recordings.cycles.len(), style.parameter, nearest(&style));
     Ok(style)
 }

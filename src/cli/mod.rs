@@ -10,6 +10,7 @@ mod observe;
 mod progress;
 mod render;
 mod track;
+mod whole;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};

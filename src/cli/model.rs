@@ -2,7 +2,7 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model, write_model};
@@ -90,10 +90,10 @@ fn build(args: BuildArgs) -> Result<()> {
     let activity = args.activity.into();
     let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
     let recordings = read_recordings(&entries, activity);
-    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     if recordings.cycles.is_empty() {
-        bail!("none of {} motions can be used for {activity}", entries.len());
+        bail!("none of {} motions can be used for {activity}{}", entries.len(), recordings.first_reason());
     }
+    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     let found = recordings.cycles.len();
     let (cycles, thinned) = database::thin(recordings.cycles);
     for t in &thinned {
@@ -170,7 +170,7 @@ fn run_validation(args: ValidateArgs) -> Result<()> {
         let _ = writeln!(csv, "{},{},{},{:.6}", s.method, s.metric, s.left_out.replace(',', ";"), s.value);
     }
     let path = args.output.join("validation.csv");
-    write_atomic(&path, csv.as_bytes())?;
+    write_atomic(&path, csv.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
     print!("{}", table(&validation.scores));
     println!("{} cases, in {} of them too few other subjects were recorded at both parameters", validation.cases, validation.sparse_cases);
     println!("written: {}", path.display());

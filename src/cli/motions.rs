@@ -33,9 +33,20 @@ pub struct Recordings {
     pub left_out: Vec<String>,
 }
 
+impl Recordings {
+    /// The end of an error message where nothing was of use.
+    pub fn first_reason(&self) -> String {
+        match &self.left_out[..] {
+            [] => String::new(),
+            [only] => format!("; {only}"),
+            [first, others @ ..] => format!("; {first}; and {} more", others.len()),
+        }
+    }
+}
+
 /// Reads and cuts all entries of one activity; files that cannot be used are listed, the others go on.
 pub fn read_recordings(entries: &[Entry], activity: Activity) -> Recordings {
-    let read: Vec<Result<(Vec<Cycle>, Vec<String>), String>> = entries.par_iter().map(|e| cycles_of(e, activity)).collect();
+    let read: Vec<_> = entries.par_iter().map(|e| cycles_of(e, activity)).collect();
     let mut recordings = Recordings::default();
     for (entry, result) in entries.iter().zip(read) {
         match result {

@@ -7,7 +7,7 @@ use clap::Args;
 use image::{ColorType, ImageEncoder, ImageFormat, codecs::png::PngEncoder};
 use rayon::prelude::*;
 
-use super::progress;
+use super::{progress, whole};
 use muybridge::body::{Clip, Pose, Shape, place};
 use muybridge::io::{calib_toml, joints_csv, read_clip, write_atomic};
 use muybridge::phantom::{DepthMap, Scene, Stage, View, depth, mask, render, render_stage, staging};
@@ -126,27 +126,10 @@ pub fn write_session(folder: &Path, take: &Take) -> Result<()> {
     }
     let occupied = folder.exists() && folder.read_dir().map(|mut entries| entries.next().is_some()).unwrap_or(true);
     ensure!(!occupied, "{}: exists already; remove it or choose another folder with -o", folder.display());
-    let parent = folder.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))?;
-    let partial = tempfile::Builder::new()
-        .prefix(".rendering")
-        .tempdir_in(parent)
-        .with_context(|| format!("cannot write in {}", parent.display()))?;
+    let partial = whole::beside(folder)?;
     write_truth(partial.path(), take)?;
     write_pictures(partial.path(), take)?;
-    make_readable(partial.path())?;
-    let partial = partial.keep();
-    std::fs::rename(&partial, folder).with_context(|| format!("cannot rename {} to {}", partial.display(), folder.display()))
-}
-
-/// Temporary folders are the owner's alone.
-pub(super) fn make_readable(folder: &Path) -> Result<()> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o755))?;
-    }
-    Ok(())
+    whole::publish(partial, folder)
 }
 
 fn write_truth(folder: &Path, take: &Take) -> Result<()> {

@@ -109,6 +109,7 @@ pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Res
 pub struct Seen {
     observations: Vec<Observation>,
     pictures: Vec<(usize, GrayImage)>,
+    floor_m: Option<f64>,
 }
 
 /// Clouds of a session; `each` sees every frame, in order.
@@ -126,15 +127,16 @@ pub fn look(session: &Session, mut each: impl FnMut(&CloudRig, &FrameSet, &Frame
         index += 1;
         each(&rig, frame, found)
     })?;
-    Ok(Seen { observations, pictures })
+    Ok(Seen { observations, pictures, floor_m: rig.floor_m(&session.rig.up.direction()) })
 }
 
 /// The fit to what was seen of a session.
 pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
-    let Seen { observations, pictures } = seen;
+    let Seen { observations, pictures, floor_m } = seen;
+    let options = FitOptions { floor_m, ..*options };
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
-    let fit = fit::fit(&observations, &session.rig, &model.model, options, &|_, share| {
+    let fit = fit::fit(&observations, &session.rig, &model.model, &options, &|_, share| {
         let percent = (100.0 * share) as u64;
         bar.inc(percent.saturating_sub(done.replace(percent)));
     })

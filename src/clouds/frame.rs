@@ -8,6 +8,7 @@ use super::{tidy, triangulate};
 use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
 use image::{GrayImage, ImageBuffer, Luma};
+use nalgebra::Vector3;
 
 /// Room around what changed, px: the reach of the correlation windows and of the outline's blur.
 const MARGIN_PX: usize = 12;
@@ -66,6 +67,20 @@ pub struct CloudRig {
 }
 
 impl CloudRig {
+    /// Height of the floor along `up`, metres: the lowest strong level among the points of the empty stage. `None` without
+    /// a stage, or where no level gathers [`FLOOR_SHARE`] of its points.
+    pub fn floor_m(&self, up: &Vector3<f64>) -> Option<f64> {
+        let (rectification, stage) = self.groups.first()?;
+        let matched = &stage.as_ref()?.views.first()?.matched;
+        let known = matched.enumerate_pixels().filter(|(u, v, d)| u % 2 == 0 && v % 2 == 0 && d.0[0] > 0.0);
+        let height = |(u, v, d): (u32, u32, &Luma<f32>)| {
+            let (u, v, d) = (u.into(), v.into(), d.0[0].into());
+            let per_px = rectification.world_jacobian(u, v, d).column(2).dot(up);
+            (rectification.world_from_pixel(u, v, d).dot(up), 1.0 / (per_px * per_px).max(1e-9))
+        };
+        lowest_level(known.map(height).collect())
+    }
+
     /// `stage_images` has one picture of the empty stage per camera of the rig.
     pub fn new(rig: &Rig, stage_images: Option<&[GrayImage]>, options: &CloudOptions) -> Result<Self, CloudError> {
         let with_stage = |group: Rectification| {
@@ -88,6 +103,38 @@ impl CloudRig {
         }
         Ok(all)
     }
+}
+
+/// Half the thickness of a level, metres.
+const LEVEL_M: f64 = 0.02;
+/// Part of all points that a level must gather; furniture and walls spread over heights.
+const FLOOR_SHARE: f64 = 0.02;
+
+/// Level of the lowest slab of ±[`LEVEL_M`] that holds [`FLOOR_SHARE`] of the heights and more than the slab just above:
+/// the median there by the second numbers, the heights' precisions, so that the near floor decides.
+fn lowest_level(mut heights: Vec<(f64, f64)>) -> Option<f64> {
+    heights.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let within = |centre: f64| {
+        let from = heights.partition_point(|h| h.0 < centre - LEVEL_M);
+        let to = heights.partition_point(|h| h.0 <= centre + LEVEL_M);
+        &heights[from..to]
+    };
+    let enough = FLOOR_SHARE * heights.len() as f64;
+    let mut centre = heights.first()?.0;
+    while centre < heights.last()?.0 {
+        if within(centre).len() as f64 >= enough && within(centre + LEVEL_M / 2.0).len() <= within(centre).len() {
+            let level = within(centre);
+            let half = 0.5 * level.iter().map(|h| h.1).sum::<f64>();
+            let mut sum = 0.0;
+            let middle = level.iter().find(|h| {
+                sum += h.1;
+                sum >= half
+            });
+            return middle.map(|h| h.0);
+        }
+        centre += LEVEL_M / 4.0;
+    }
+    None
 }
 
 impl Stage {
@@ -217,6 +264,19 @@ fn points(rectification: &Rectification, reference: &(PreparedView, ViewDisparit
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lowest_level_is_the_floor_under_a_table_and_between_walls() {
+        let noise = |i: usize| 0.008 * ((i * 7919 % 101) as f64 / 50.0 - 1.0);
+        let wall = (0..3000).map(|i| (-0.3 + i as f64 * 1e-3, 1.0));
+        let near = (0..300).map(|i| (0.12 + 0.1 * noise(i), 100.0));
+        let far = (0..500).map(|i| (0.11 + noise(i), 1.0));
+        let table = (0..900).map(|i| (0.7 + noise(i), 1.0));
+        let level = lowest_level(wall.clone().chain(near).chain(far).chain(table).collect()).unwrap();
+        assert!((level - 0.12).abs() < 0.002, "{level}");
+        assert_eq!(lowest_level(wall.collect()), None);
+        assert_eq!(lowest_level(Vec::new()), None);
+    }
     use std::path::{Path, PathBuf};
 
     fn footage(name: &str) -> Option<PathBuf> {
@@ -268,7 +328,7 @@ mod tests {
     fn score(rig: &Rig, frame: &FrameCloud, folder: &Path, number: usize) -> [f64; 4] {
         let truth = grey(folder.join(format!("truth/mask_cam_00/{number:06}.png")));
         let depth = image::open(folder.join(format!("truth/depth_cam_00/{number:06}.png"))).unwrap().into_luma16();
-        let (wide, tight) = (super::super::masks::box_vote(&truth, 2, 0.0), super::super::masks::box_vote(&truth, 2, 0.999));
+        let (wide, tight) = (crate::footage::regions::box_vote(&truth, 2, 0.0), crate::footage::regions::box_vote(&truth, 2, 0.999));
         let mut covered = GrayImage::new(640, 480);
         let (mut errors, mut off) = (Vec::new(), 0.0);
         for point in &frame.cloud.points {
@@ -281,7 +341,7 @@ mod tests {
                 errors.push((rig.cameras[0].camera_point(&point.position).z - z).abs());
             }
         }
-        let covered = super::super::masks::box_vote(&covered, 1, 0.0);
+        let covered = crate::footage::regions::box_vote(&covered, 1, 0.0);
         let count = |f: &dyn Fn(bool, bool, bool) -> bool| {
             let mask = frame.masks[0].as_ref().unwrap();
             let all = truth.iter().zip(mask.iter()).zip(covered.iter());

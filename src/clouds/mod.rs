@@ -3,7 +3,6 @@
 pub mod cloud;
 pub mod correlate;
 pub mod frame;
-pub mod masks;
 pub mod prefilter;
 pub mod stage;
 pub mod stereo;

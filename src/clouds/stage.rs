@@ -8,9 +8,9 @@
 //! Fails where the person stays within [`StageOptions::clearance_m`] of the stage, and for mirrors and curtains.
 
 use super::correlate::Region;
-use super::masks;
 use super::prefilter::blur;
 use super::stereo::{PreparedView, StereoOptions, ViewDisparity, match_views};
+use crate::footage::regions;
 use crate::rig::rectify::{Plane, Rectification};
 use image::{GrayImage, Luma};
 
@@ -58,6 +58,9 @@ pub struct Stage {
 #[derive(Clone, Debug)]
 pub(crate) struct StageView {
     pub plane: Plane,
+    /// As matched, px; NaN where nothing was found.
+    pub matched: Plane,
+    /// The same with its gaps filled.
     pub disparity: Plane,
 }
 
@@ -68,7 +71,11 @@ impl Stage {
             (0..images.len()).map(|k| PreparedView::new(rectification.warp(k, images[k]), rectification.views[k].step)).collect();
         let regions = vec![whole(rectification); prepared.len()];
         let found = match_views(&prepared, &regions, [0, largest_px], options);
-        let views = prepared.into_iter().zip(found).map(|(p, f)| StageView { plane: p.plane, disparity: fill_gaps(&f.disparity) });
+        let views = prepared.into_iter().zip(found).map(|(p, f)| StageView {
+            plane: p.plane,
+            disparity: fill_gaps(&f.disparity),
+            matched: f.disparity,
+        });
         Self { views: views.collect() }
     }
 }
@@ -185,9 +192,9 @@ fn median(values: impl Iterator<Item = f32>, known: &[bool]) -> f32 {
 /// The box around the changed pieces of at least the smallest size, with a margin; `None` when there are none.
 pub(crate) fn changed_box(changed: &GrayImage, options: &StageOptions, margin: usize) -> Option<Region> {
     let (width, height) = (changed.width() as usize, changed.height() as usize);
-    let solid = masks::box_vote(changed, 1, 0.6);
+    let solid = regions::box_vote(changed, 1, 0.6);
     let mut found: Option<Region> = None;
-    for piece in masks::pieces(&solid, |v| v != 0).into_iter().filter(|p| p.len() >= options.smallest_piece_px) {
+    for piece in regions::pieces(&solid, false).into_iter().filter(|p| p.len() >= options.smallest_piece_px) {
         for i in piece {
             let (x, y) = (i % width, i / width);
             let b = found.get_or_insert(Region { x: [x, x], y: [y, y] });
@@ -222,9 +229,9 @@ pub(crate) fn person_mask(
     let (person, ground) = (density(Label::Person), density(Label::Stage));
     let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && person[i] > ground[i]);
     let mut mask = GrayImage::from_fn(width, height, |x, y| Luma([if set((y * width + x) as usize) { 255 } else { 0 }]));
-    mask = masks::box_vote(&mask, 1, 0.5);
-    masks::keep_large(&mut mask, options.smallest_piece_px);
-    masks::fill_holes(&mut mask, options.largest_hole_px);
+    mask = regions::box_vote(&mask, 1, 0.5);
+    mask = regions::keep_large(&mask, options.smallest_piece_px);
+    mask = regions::fill_holes(&mask, options.largest_hole_px);
     trim_outline(&mut mask, &changes[k].difference);
     mask
 }

@@ -46,13 +46,15 @@ pub struct FitOptions {
     pub points: usize,
     /// Silhouette rays per camera and frame.
     pub rays: usize,
+    /// Height of the floor along the rig's up axis, metres, where it is known.
+    pub floor_m: Option<f64>,
 }
 
 impl Default for FitOptions {
     /// Twenty components reach 2.5 degrees against the true joints where ten reach 4 (fit on CMU walks); 500 points and
     /// 100 rays a frame cost about the same as the silhouettes' search and more change nothing.
     fn default() -> Self {
-        FitOptions { components: 20, points: 500, rays: 100 }
+        FitOptions { components: 20, points: 500, rays: 100, floor_m: None }
     }
 }
 
@@ -91,9 +93,9 @@ const SETTINGS: Settings = Settings {
     phase_acceleration: 1.35,
     tilt: 0.08,
     stature: 0.03,
-    length: 0.025,
-    arm_length: 0.05,
-    width: 0.08,
+    length: 0.018,
+    arm_length: 0.04,
+    width: 0.12,
 };
 
 /// Steadiness of the phase while the start is still rough.
@@ -129,7 +131,7 @@ impl Run<'_> {
             let (next, summary) = minimise(problem, state, &LmOptions { max_iterations: 6, relative_cost: 1e-4 });
             self.iterations += summary.iterations;
             state = next;
-            let cost = total(&fitness(curve, frames, &settings, &self.known.viewpoint, &state)).cost;
+            let cost = total(&fitness(curve, frames, &settings, &self.known, &state)).cost;
             if (previous - cost).abs() < 1e-3 * cost {
                 break;
             }
@@ -163,16 +165,18 @@ pub fn fit(
     }
     let up = rig.up.direction();
     let viewpoint = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len().max(1) as f64;
-    let track = start::track(observations, &viewpoint, &up)?;
+    let track = start::track(observations, &viewpoint, &up, options.floor_m)?;
     let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
-    let chosen =
-        |points, rays| observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, points, rays)).collect();
-    let sparse: Vec<Frame> = chosen(200, 40);
+    let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: options.floor_m.filter(|floor| *floor == track.floor_m) };
+    let chosen = |points, rays| -> Vec<Frame> {
+        observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
+    };
+    let sparse = chosen(200, 40);
     progress("search for cadence and phase", 0.0);
     let mean = Curve::new(model, 0);
     let search = Settings { model_m: 0.06, ..SETTINGS };
-    let found = start::hypotheses(&track, &sparse, &mean, model, &search, &viewpoint);
-    let mut run = Run { model, known: Known { viewpoint, up, stature_m: track.stature_m }, iterations: 0 };
+    let found = start::hypotheses(&track, &sparse, &mean, model, &search, &known);
+    let mut run = Run { model, known, iterations: 0 };
     progress("both half-cycles", 0.1);
     let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
     let ten = Curve::new(model, 10);
@@ -180,14 +184,14 @@ pub fn fit(
         .into_iter()
         .map(|h| {
             let state = run.rough(h.state.clone(), &sparse);
-            (total(&fitness(&ten, &sparse, &rough_settings, &viewpoint, &state)).cost, state)
+            (total(&fitness(&ten, &sparse, &rough_settings, &known, &state)).cost, state)
         })
         .collect();
     candidates.sort_by(|a, b| a.0.total_cmp(&b.0));
     let hypotheses = [candidates[0].0, candidates.last().map_or(candidates[0].0, |c| c.0)];
     let mut state = candidates.swap_remove(0).1;
 
-    let dense: Vec<Frame> = chosen(options.points, options.rays);
+    let dense = chosen(options.points, options.rays);
     progress("all points", 0.4);
     let free_phase = SETTINGS.phase_acceleration;
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, phase_acceleration: free_phase, refreshes: 5 });
@@ -216,7 +220,7 @@ fn finish(run: Run, state: State, curve: Curve, frames: &[Frame], observations: 
         (DMatrix::from_element(size, size, f64::NAN), nalgebra::DVector::from_element(state::LOCAL * frames.len(), f64::NAN))
     });
     let frame_sigmas = variances.as_slice().chunks_exact(state::LOCAL).map(|v| std::array::from_fn(|i| v[i].sqrt())).collect();
-    let frames = fitness(&curve, frames, &SETTINGS, &run.known.viewpoint, &state);
+    let frames = fitness(&curve, frames, &SETTINGS, &run.known, &state);
     let poses = (0..state.carriers.len()).map(|t| state.pose(&curve, t)).collect();
     let seconds = observations.last().map_or(0.0, |o| o.time_s) - observations.first().map_or(0.0, |o| o.time_s);
     let (first, last) = (&state.carriers[0], &state.carriers[state.carriers.len() - 1]);

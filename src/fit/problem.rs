@@ -8,6 +8,8 @@
 //! frozen too (envelope theorem: its motion along the ray changes the distance in second order only).
 //! A primitive's centre that projects outside a silhouette counts with its distance to it, else nothing would hold back
 //! limbs that reach where no point is.
+//! Feet do not sink into the floor: a foot primitive counts with the depth of its underside below it; rays that pass the
+//! body just above the floor see contact shadows as often as soles and are left out.
 //! Stereo sees front sides: a point where the skin faces away from the cameras has weight zero.
 //! Checked against central differences for every kind of unknown.
 
@@ -19,7 +21,7 @@ use rayon::prelude::*;
 use super::curve::Curve;
 use super::state::{LOCAL, Motion, SharedLayout, State};
 use crate::body::surface::{Evaluation, SKIN};
-use crate::body::{Length, NODES, PosedSurface};
+use crate::body::{Joint, Length, NODES, PosedSurface};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::distance_field::DistanceField;
 use crate::math::rotation::{hat, left_jacobian, log};
@@ -79,6 +81,8 @@ pub struct Known {
     pub up: Vector3<f64>,
     /// Expected stature, metres.
     pub stature_m: f64,
+    /// Height of the floor along `up`, metres, where it is known.
+    pub floor_m: Option<f64>,
 }
 
 /// Which unknowns may move.
@@ -130,6 +134,10 @@ const OUTSIDE_CAUCHY: f64 = 6.0;
 const FACING: f64 = 0.2;
 /// Primitives that a ray passes nearest to, tried as the start of its closest approach.
 const CANDIDATES: usize = 6;
+/// Precision of the floor times the share of new information per primitive: 15 mm, 0.3.
+const SUNKEN_WEIGHT: f64 = 0.3 / (0.015 * 0.015);
+/// Outlines lower than this above the floor are those of contact shadows.
+const CONTACT_M: f64 = 0.06;
 /// Added to the distance of a point that only the far side of the body explains.
 const BEHIND_M: f64 = 0.1;
 
@@ -164,7 +172,7 @@ impl<'a> Problem<'a> {
             .into_par_iter()
             .map(|t| {
                 let surface = state.posed(curve, t).surface;
-                (freeze(&frames[t], &surface, settings, &known.viewpoint).0, freeze_outsides(&frames[t], &surface, settings).0)
+                (freeze(&frames[t], &surface, settings, known).0, freeze_outsides(&frames[t], &surface, settings).0)
             })
             .unzip();
         Problem { curve, frames, settings, free, known, frozen, frozen_outsides }
@@ -186,11 +194,7 @@ impl<'a> Problem<'a> {
         let (distance, gradient) = outside.field.at(pixel.x, pixel.y);
         let pull = jacobian.transpose() * nalgebra::Vector2::from(gradient) * frozen.metres_per_px;
         let layout = state.layout();
-        let moment = p.centre.cross(&pull);
-        let wrench = [pull.x, pull.y, pull.z, moment.x, moment.y, moment.z];
-        for (column, entry) in motion.twists[p.node as usize].column_iter().zip(row.iter_mut()) {
-            *entry += (0..6).map(|i| wrench[i] * column[i]).sum::<f64>();
-        }
+        add_wrench(row, &motion.twists[p.node as usize], &p.centre, &pull);
         row[LOCAL + layout.stature()] += pull.dot(&(p.centre - state.carriers[frame].position));
         row[LOCAL + layout.length(p.limb)] += pull.dot(&p.length_velocity(&Vector3::zeros(), state.shape.lengths[p.limb as usize]));
         distance * frozen.metres_per_px
@@ -218,11 +222,7 @@ impl<'a> Problem<'a> {
         }
         for (node, twist) in motion.twists.iter().enumerate() {
             if let Some(f) = scratch.wrench[node] {
-                let moment = frozen.x.cross(&f);
-                let wrench = [f.x, f.y, f.z, moment.x, moment.y, moment.z];
-                for (column, entry) in twist.column_iter().zip(scratch.row.iter_mut()) {
-                    *entry += (0..6).map(|i| wrench[i] * column[i]).sum::<f64>();
-                }
+                add_wrench(&mut scratch.row, twist, &frozen.x, &f);
             }
         }
         scratch.row[LOCAL + layout.stature()] += force.dot(&(frozen.x - state.carriers[frame].position));
@@ -247,7 +247,28 @@ impl<'a> Problem<'a> {
                 }
             }
         }
+        for index in feet(&motion.surface) {
+            let residual = self.sunken_row(&motion, state, frame, index, &mut scratch.row);
+            if residual > 0.0 {
+                normal.add(residual, SUNKEN_WEIGHT, &scratch.row);
+            }
+        }
         normal
+    }
+
+    /// Depth of the underside of primitive `index` below the floor, metres, negative above, and its row.
+    fn sunken_row(&self, motion: &Motion, state: &State, frame: usize, index: usize, row: &mut [f64]) -> f64 {
+        let p = &motion.surface.primitives[index];
+        row.fill(0.0);
+        let down = -self.known.up;
+        let layout = state.layout();
+        add_wrench(row, &motion.twists[p.node as usize], &p.centre, &down);
+        let from_carrier = p.centre - state.carriers[frame].position;
+        let radius = underside(p.semi_axes.y);
+        row[LOCAL + layout.stature()] += down.dot(&from_carrier) + radius;
+        row[LOCAL + layout.length(p.limb)] += down.dot(&p.length_velocity(&Vector3::zeros(), state.shape.lengths[p.limb as usize]));
+        row[LOCAL + layout.width(p.limb)] += radius / state.shape.widths[p.limb as usize];
+        sunken_m(self.known, &p.centre, p.semi_axes.y)
     }
 
     /// The silhouettes of a frame with their frozen quantities, one per primitive.
@@ -275,7 +296,11 @@ impl<'a> Problem<'a> {
                 .zip(frozen)
                 .map(|(p, f)| 0.5 * f.weight * (outside_px(outside, &p.centre) * f.metres_per_px).powi(2))
         });
-        points + outside.sum::<f64>()
+        let sunken = feet(&posed.surface).map(|i| {
+            let p = &posed.surface.primitives[i];
+            0.5 * SUNKEN_WEIGHT * sunken_m(self.known, &p.centre, p.semi_axes.y).max(0.0).powi(2)
+        });
+        points + outside.sum::<f64>() + sunken.sum::<f64>()
     }
 
     /// Residuals of the shared priors: index into z, value, derivative.
@@ -383,6 +408,30 @@ impl<'a> Problem<'a> {
     }
 }
 
+/// Adds force times velocity of the material at `x` for every unknown of `twist`.
+fn add_wrench(row: &mut [f64], twist: &DMatrix<f64>, x: &Vector3<f64>, force: &Vector3<f64>) {
+    let moment = x.cross(force);
+    let wrench = [force.x, force.y, force.z, moment.x, moment.y, moment.z];
+    for (column, entry) in twist.column_iter().zip(row.iter_mut()) {
+        *entry += (0..6).map(|i| wrench[i] * column[i]).sum::<f64>();
+    }
+}
+
+/// Primitives of the feet; their chains run along z, so y is their height.
+fn feet(surface: &PosedSurface) -> impl Iterator<Item = usize> + '_ {
+    let on_foot = |node: Joint| matches!(node, Joint::LAnkle | Joint::RAnkle | Joint::LMidtarsal | Joint::RMidtarsal);
+    surface.primitives.iter().enumerate().filter(move |(_, p)| on_foot(p.node)).map(|(i, _)| i)
+}
+
+/// Skin below the centre of a chain's primitive of this semi-axis, metres.
+fn underside(semi_axis: f64) -> f64 {
+    SKIN.sqrt() * semi_axis
+}
+
+fn sunken_m(known: &Known, centre: &Vector3<f64>, semi_axis: f64) -> f64 {
+    known.floor_m.map_or(f64::NEG_INFINITY, |floor| floor - centre.dot(&known.up) + underside(semi_axis))
+}
+
 struct FrameNormal {
     cost: f64,
     /// Lower half, row-major.
@@ -483,7 +532,7 @@ impl ArrowProblem for Problem<'_> {
 }
 
 /// Frozen weights of one frame at a posed surface, and how well it fits.
-fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings, viewpoint: &Vector3<f64>) -> (Vec<Frozen>, Fitness) {
+fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings, known: &Known) -> (Vec<Frozen>, Fitness) {
     let mut evaluation = Evaluation::default();
     let mut fitness = Fitness::default();
     let frozen = frame.targets.iter().map(|target| {
@@ -494,11 +543,14 @@ fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings, viewpoint:
         surface.evaluate_into(&x, &mut evaluation);
         let normal = evaluation.gradient.normalize();
         let (variance, hidden) = match target {
-            Target::Point { covariance, .. } => (normal.dot(&(covariance * normal)), normal.dot(&(x - viewpoint).normalize()) > FACING),
-            Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), false),
+            Target::Point { covariance, .. } => {
+                (normal.dot(&(covariance * normal)), normal.dot(&(x - known.viewpoint).normalize()) > FACING)
+            }
+            Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), near_floor(known, &x)),
         };
         let precision = 1.0 / (variance + settings.model_m * settings.model_m);
-        let distance = evaluation.distance().abs() + if hidden { BEHIND_M } else { 0.0 };
+        let behind = hidden && matches!(target, Target::Point { .. });
+        let distance = evaluation.distance().abs() + if behind { BEHIND_M } else { 0.0 };
         let scaled = distance * distance * precision / (CAUCHY * CAUCHY);
         let robust = if hidden { 0.0 } else { 1.0 / (1.0 + scaled) };
         fitness.cost += base * 0.5 * CAUCHY * CAUCHY * scaled.ln_1p();
@@ -530,11 +582,15 @@ fn freeze_outsides(frame: &Frame, surface: &PosedSurface, settings: &Settings) -
     (frozen.collect(), cost)
 }
 
+fn near_floor(known: &Known, x: &Vector3<f64>) -> bool {
+    known.floor_m.is_some_and(|floor| x.dot(&known.up) < floor + CONTACT_M)
+}
+
 /// Robust fitness of each frame at a state.
-pub fn fitness(curve: &Curve, frames: &[Frame], settings: &Settings, viewpoint: &Vector3<f64>, state: &State) -> Vec<Fitness> {
+pub fn fitness(curve: &Curve, frames: &[Frame], settings: &Settings, known: &Known, state: &State) -> Vec<Fitness> {
     let of_frame = |t: usize| {
         let surface = state.posed(curve, t).surface;
-        let points = freeze(&frames[t], &surface, settings, viewpoint).1;
+        let points = freeze(&frames[t], &surface, settings, known).1;
         Fitness { cost: points.cost + freeze_outsides(&frames[t], &surface, settings).1, ..points }
     };
     (0..frames.len()).into_par_iter().map(of_frame).collect()
@@ -610,7 +666,8 @@ mod tests {
         arm_length: 0.06,
         width: 0.1,
     };
-    const KNOWN: Known = Known { viewpoint: Vector3::new(0.1, 0.0, 1.0), up: Vector3::new(0.0, 0.0, 1.0), stature_m: 1.75 };
+    const KNOWN: Known =
+        Known { viewpoint: Vector3::new(0.1, 0.0, 1.0), up: Vector3::new(0.0, 0.0, 1.0), stature_m: 1.75, floor_m: Some(0.12) };
     const ALL: Free = Free { rotation: true, phase: true, weights: true, stature: true, lengths: true, widths: true };
 
     fn state() -> State {

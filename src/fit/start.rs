@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::FitError;
 use super::curve::Curve;
-use super::problem::{Frame, Settings, fitness, total};
+use super::problem::{Frame, Known, Settings, fitness, total};
 use super::state::{Carrier, State};
 use super::targets::Observation;
 use crate::body::Shape;
@@ -21,6 +21,8 @@ use crate::motion_model::Model;
 const FEWEST_POINTS: usize = 60;
 /// From the front of the body to its middle.
 const HALF_DEPTH_M: f64 = 0.09;
+/// A floor farther than this from the lowest points is not the one that the person walks on.
+const STANDING_ON_M: f64 = 0.2;
 /// Slower than this the path has no heading and all directions are tried.
 const STANDING_M_S: f64 = 0.25;
 const CADENCES: [f64; 5] = [0.8, 0.9, 1.0, 1.1, 1.2];
@@ -33,7 +35,7 @@ const SEARCH_FRAMES: usize = 18;
 #[derive(Clone, Debug)]
 pub struct Track {
     pub stature_m: f64,
-    /// Height of the lowest points along the up axis, metres.
+    /// Height of the floor along the up axis, metres.
     pub floor_m: f64,
     /// Carrier positions per frame.
     positions: Vec<Vector3<f64>>,
@@ -53,13 +55,14 @@ pub struct Hypothesis {
 }
 
 /// Track, heading and stature from the clouds.
-pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector3<f64>) -> Result<Track, FitError> {
+pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector3<f64>, floor_m: Option<f64>) -> Result<Track, FitError> {
     let seen: Vec<(f64, Vector3<f64>)> =
         observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS).map(|o| (o.time_s, median(o))).collect();
     if seen.len() < 5 {
         return Err(FitError::NobodySeen { frames: observations.len(), with_person: seen.len(), points: FEWEST_POINTS });
     }
-    let (floor, top) = extent(observations, up);
+    let (lowest, top) = extent(observations, up);
+    let floor = floor_m.filter(|floor| (floor - lowest).abs() < STANDING_ON_M).unwrap_or(lowest);
     let stature = (top - floor).clamp(1.2, 2.1);
     let horizontal = |v: Vector3<f64>| v - up * v.dot(up);
     let deeper: Vec<Vector3<f64>> =
@@ -132,14 +135,7 @@ fn expected_cadence(model: &Model, speed: f64, hip_height: f64) -> f64 {
 }
 
 /// Starts in order of their cost.
-pub fn hypotheses(
-    track: &Track,
-    frames: &[Frame],
-    curve: &Curve,
-    model: &Model,
-    settings: &Settings,
-    viewpoint: &Vector3<f64>,
-) -> Vec<Hypothesis> {
+pub fn hypotheses(track: &Track, frames: &[Frame], curve: &Curve, model: &Model, settings: &Settings, known: &Known) -> Vec<Hypothesis> {
     let hip_height = Shape::template(track.stature_m).hip_height_m();
     let cyclic = curve.is_cyclic();
     let cadence = if cyclic {
@@ -173,7 +169,7 @@ pub fn hypotheses(
         .map(|(heading, hz, phase)| {
             let state = state_of(track, frames, curve, heading, *hz, *phase);
             let some = State { carriers: chosen.iter().map(|t| state.carriers[*t].clone()).collect(), ..state.clone() };
-            let cost = total(&fitness(curve, &searched, settings, viewpoint, &some)).cost;
+            let cost = total(&fitness(curve, &searched, settings, known, &some)).cost;
             Hypothesis { state, cost, phase: *phase, cadence_hz: *hz }
         })
         .collect();

@@ -24,6 +24,8 @@ pub struct Observation {
 
 /// Edge of the cubes over which points are averaged: about a correlation window, below which points say the same thing.
 const VOXEL_M: f64 = 0.025;
+/// Points lower than this above the floor are the floor in the person's shadow as often as the person.
+const SHADOW_M: f64 = 0.03;
 /// Uncertainty of a mask's outline.
 const OUTLINE_PX: f64 = 1.5;
 /// Cells of the distance to a silhouette: half the memory of pixels in each direction, a centimetre at 3 m.
@@ -44,9 +46,18 @@ pub fn outsides(observation: &Observation, rig: &Rig) -> Vec<Outside> {
         .collect()
 }
 
-/// At most `points` cloud points and `rays` silhouette rays per camera, evenly chosen.
-pub fn frame(observation: &Observation, rig: &Rig, outsides: &Arc<Vec<Outside>>, points: usize, rays: usize) -> Frame {
-    let mut targets = evenly(&thinned(&observation.cloud), points);
+/// At most `points` cloud points and `rays` silhouette rays per camera, evenly chosen; the floor is at height `floor_m`.
+pub fn frame(
+    observation: &Observation,
+    rig: &Rig,
+    outsides: &Arc<Vec<Outside>>,
+    floor_m: Option<f64>,
+    points: usize,
+    rays: usize,
+) -> Frame {
+    let up = rig.up.direction();
+    let lowest = floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M);
+    let mut targets = evenly(&thinned(&observation.cloud, |x| x.dot(&up) > lowest), points);
     for (camera, mask) in rig.cameras.iter().zip(&observation.masks) {
         if let Some(mask) = mask {
             targets.extend(evenly(&outline(mask), rays).iter().filter_map(|pixel| ray(camera, pixel)));
@@ -63,9 +74,9 @@ fn evenly<T: Clone>(items: &[T], wanted: usize) -> Vec<T> {
 }
 
 /// Mean position and mean covariance of the points in each cube of [`VOXEL_M`].
-fn thinned(cloud: &Cloud) -> Vec<Target> {
+fn thinned(cloud: &Cloud, wanted: impl Fn(&Vector3<f64>) -> bool) -> Vec<Target> {
     let mut cubes: BTreeMap<[i64; 3], (Vector3<f64>, Matrix3<f64>, f64)> = BTreeMap::new();
-    for point in &cloud.points {
+    for point in cloud.points.iter().filter(|p| wanted(&p.position)) {
         let key = [0, 1, 2].map(|k| (point.position[k] / VOXEL_M).floor() as i64);
         let cube = cubes.entry(key).or_insert((Vector3::zeros(), Matrix3::zeros(), 0.0));
         cube.0 += point.position;
@@ -121,8 +132,8 @@ mod tests {
             confidence: 1.0,
             covariance: Matrix3::identity() * x,
         };
-        let cloud = Cloud { points: vec![point(0.004), point(0.012), point(0.5)] };
-        let targets = thinned(&cloud);
+        let cloud = Cloud { points: vec![point(0.004), point(0.012), point(0.5), point(2.0)] };
+        let targets = thinned(&cloud, |x| x.x < 1.0);
         assert_eq!(targets.len(), 2);
         assert!(
             matches!(&targets[0], Target::Point { x, covariance } if (x.x - 0.008).abs() < 1e-12 && (covariance[(0, 0)] - 0.008).abs() < 1e-12)

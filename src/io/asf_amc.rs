@@ -19,8 +19,8 @@ const METRES_PER_INCH: f64 = 0.0254;
 
 #[derive(Debug, thiserror::Error)]
 pub enum AsfAmcError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
     #[error("{path}:{line}: {what}")]
     Syntax { path: PathBuf, line: usize, what: String },
     #[error("{amc}: no skeleton found beside it; put {wanted} there")]
@@ -44,7 +44,7 @@ fn at(path: &Path) -> impl Fn(Fault) -> AsfAmcError {
 }
 
 fn text(path: &Path) -> Result<String, AsfAmcError> {
-    let bytes = std::fs::read(path).map_err(|source| AsfAmcError::Read { path: path.into(), source })?;
+    let bytes = std::fs::read(path).map_err(|cause| AsfAmcError::Read { path: path.into(), cause })?;
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
@@ -60,7 +60,7 @@ fn skeleton_beside(amc: &Path) -> Result<PathBuf, AsfAmcError> {
         }
     }
     let folder = amc.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let entries = std::fs::read_dir(folder).map_err(|source| AsfAmcError::Read { path: folder.into(), source })?;
+    let entries = std::fs::read_dir(folder).map_err(|cause| AsfAmcError::Read { path: folder.into(), cause })?;
     let is_asf = |p: &PathBuf| p.extension().is_some_and(|e| e.eq_ignore_ascii_case("asf"));
     let found: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(is_asf).collect();
     match <[PathBuf; 1]>::try_from(found) {

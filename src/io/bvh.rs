@@ -17,17 +17,17 @@ use crate::body::{Clip, Joint, Pose};
 
 #[derive(Debug, thiserror::Error)]
 pub enum BvhError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
     #[error("{path}:{line}: {what}")]
     Syntax { path: PathBuf, line: usize, what: String },
-    #[error("cannot write {path}: {source}")]
-    Write { path: PathBuf, source: std::io::Error },
+    #[error("cannot write {path}: {cause}")]
+    Write { path: PathBuf, cause: std::io::Error },
 }
 
 /// Reads a BVH file; unit unknown.
 pub fn read(path: &Path) -> Result<Recording, BvhError> {
-    let bytes = std::fs::read(path).map_err(|source| BvhError::Read { path: path.into(), source })?;
+    let bytes = std::fs::read(path).map_err(|cause| BvhError::Read { path: path.into(), cause })?;
     let text = String::from_utf8_lossy(&bytes);
     parse(&text).map_err(|(line, what)| BvhError::Syntax { path: path.into(), line, what })
 }
@@ -223,7 +223,7 @@ fn parse_frame(hierarchy: &Hierarchy, line: usize, text: &str) -> Result<Recorde
 
 /// Writes a clip and its side-car `path` with `.json`; `clip_from_rig` is the rotation from the rig's world, if any.
 pub fn write_clip(path: &Path, clip: &Clip, clip_from_rig: Option<&Rotation3<f64>>) -> Result<(), BvhError> {
-    let write = |path: &Path, bytes: &[u8]| write_atomic(path, bytes).map_err(|source| BvhError::Write { path: path.into(), source });
+    let write = |path: &Path, bytes: &[u8]| write_atomic(path, bytes).map_err(|cause| BvhError::Write { path: path.into(), cause });
     write(path, text_of(clip).as_bytes())?;
     write(&path.with_extension("json"), Sidecar::of_bvh(clip, clip_from_rig).to_json().as_bytes())
 }

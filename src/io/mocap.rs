@@ -17,8 +17,8 @@ pub enum MocapError {
     AsfAmc(#[from] AsfAmcError),
     #[error(transparent)]
     Mot(#[from] MotError),
-    #[error("{path}: {source}")]
-    Mapping { path: PathBuf, source: MappingError },
+    #[error("{path}: {cause}")]
+    Mapping { path: PathBuf, cause: MappingError },
     #[error("{path}: not a motion file that can be read; give .bvh, .amc (with its .asf beside it), .mot or .sto")]
     Kind { path: PathBuf },
 }
@@ -40,7 +40,7 @@ pub fn is_motion_file(path: &Path) -> bool {
 
 /// Reads `.bvh`, `.amc` (with the `.asf` found beside it), `.mot` or `.sto`.
 pub fn read_clip(path: &Path) -> Result<ReadClip, MocapError> {
-    let mapped = |recording: Recording| clip_from_recording(&recording).map_err(|source| MocapError::Mapping { path: path.into(), source });
+    let mapped = |recording: Recording| clip_from_recording(&recording).map_err(|cause| MocapError::Mapping { path: path.into(), cause });
     let (mut clip, notices) = match ending(path).as_str() {
         "bvh" => mapped(bvh::read(path)?)?,
         "amc" => mapped(asf_amc::read(path)?)?,

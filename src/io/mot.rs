@@ -17,8 +17,8 @@ use crate::math::rotation::exp;
 
 #[derive(Debug, thiserror::Error)]
 pub enum MotError {
-    #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: std::io::Error },
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
     #[error("{path}:{line}: {what}")]
     Syntax { path: PathBuf, line: usize, what: String },
     #[error("{path}: no column {columns}; write joint angles of a gait2392, Hamner or Rajagopal model")]
@@ -59,7 +59,7 @@ const HIP_UP: f64 = -0.0367;
 
 /// Reads a `.mot` or `.sto`; with the clip come notices, one sentence each.
 pub fn read(path: &Path) -> Result<(Clip, Vec<String>), MotError> {
-    let bytes = std::fs::read(path).map_err(|source| MotError::Read { path: path.into(), source })?;
+    let bytes = std::fs::read(path).map_err(|cause| MotError::Read { path: path.into(), cause })?;
     let (table, mut notices) =
         parse(&String::from_utf8_lossy(&bytes)).map_err(|(line, what)| MotError::Syntax { path: path.into(), line, what })?;
     let missing: Vec<&str> = REQUIRED.into_iter().filter(|n| table.column(n).is_none()).collect();

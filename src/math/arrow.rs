@@ -249,7 +249,7 @@ mod tests {
     fn step_and_covariances_equal_the_dense_ones() {
         let problem = decays();
         let state = (vec![1.4, 0.9, 1.1, 1.0, 2.0, 1.3], 0.2);
-        let j = (&problem).jacobian(&state);
+        let j = problem.jacobian(&state);
         let h = j.tr_mul(&j);
         let g = j.tr_mul(&DVector::from_vec(problem.residuals(&state)));
         let expected = -h.clone().cholesky().unwrap().solve(&g);

@@ -12,7 +12,7 @@
 //! third view has its own (not integer) step, which (2) allows. Fails when a third camera near the line leaves the plane
 //! by more than [`PLANE_TOLERANCE_M`], or the cameras look in directions more than 60 degrees apart.
 //!
-//! Follows algorithms.md 2.4 in its general form. Checked against the raw cameras' own projection and cv::stereoRectify.
+//! Checked against the raw cameras' own projection and cv::stereoRectify.
 
 use super::{Camera, Rig};
 use image::{GrayImage, ImageBuffer, Luma};

@@ -23,8 +23,9 @@ use muybridge::style::{Metric, Population, Style};
 
 use super::check;
 use super::model::default_variance;
-use super::render::{Take, make_readable, write_session};
+use super::render::{Take, write_session};
 use super::track::{self, NamedModel, Tracked};
+use super::whole::make_readable;
 
 /// A person the embedded database (seeds 1 to 9) does not hold.
 const SUBJECT: u64 = 1000;

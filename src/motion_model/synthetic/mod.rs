@@ -12,12 +12,11 @@ mod variation;
 mod walking;
 
 use nalgebra::Vector3;
-use rand_chacha::ChaCha12Rng;
 use rayon::prelude::*;
 
 use self::jumping::Habit;
 use self::posture::Angles;
-use self::variation::{Style, add_cycle_noise, cycle_rng, normal, subject_rng, uniform};
+use self::variation::{Style, Tracks, add_cycle_noise, cycle_rng, normal, subject_rng, uniform};
 use super::cycle::{Activity, Cycle, RootSample};
 use crate::body::{Joint, Length, NODES, Shape};
 
@@ -82,23 +81,45 @@ impl SyntheticSubject {
 
     /// One recorded cycle: the subject's motion at `parameter` (m/s, for jumps m) with the variation of one cycle.
     pub fn cycle(&self, parameter: f64, repeat: u32) -> Cycle {
-        self.make(parameter, Some(repeat))
+        self.make(parameter, &self.tracks(parameter), Some(repeat))
     }
 
     /// The subject's true motion at `parameter`, without the variation from cycle to cycle.
     pub fn mean_cycle(&self, parameter: f64) -> Cycle {
-        self.make(parameter, None)
+        self.make(parameter, &self.tracks(parameter), None)
+    }
+
+    fn cycles(&self, parameter: f64) -> Vec<Cycle> {
+        let tracks = self.tracks(parameter);
+        (0..REPEATS).map(|repeat| self.make(parameter, &tracks, Some(repeat))).collect()
+    }
+
+    /// The subject's own curves at a parameter. Speed and length count in hip heights.
+    fn tracks(&self, parameter: f64) -> Tracks {
+        let relative = parameter / self.hip_height_m;
+        match self.activity {
+            Activity::Walking => self.style.tracks(relative, walking::REFERENCE_RV, true, walking::population),
+            Activity::Running => self.style.tracks(relative, running::REFERENCE_RV, true, running::population),
+            Activity::Jumping => self.style.tracks(relative, jumping::REFERENCE, false, jumping::population),
+        }
     }
 
     fn sole(&self, angles: &Angles, side: usize) -> (posture::Sole, f64) {
         angles.sole(side, &self.offsets, self.stature_m)
     }
 
-    fn make(&self, parameter: f64, repeat: Option<u32>) -> Cycle {
+    fn make(&self, parameter: f64, tracks: &Tracks, repeat: Option<u32>) -> Cycle {
+        let mut tracks = tracks.clone();
         let mut rng = repeat.map(|r| cycle_rng(self.seed, self.activity, parameter, r));
+        if let Some(rng) = &mut rng {
+            add_cycle_noise(&mut tracks, rng);
+        }
         let (angles, root, duration_s) = match self.activity {
-            Activity::Jumping => self.jump(parameter, rng.as_mut()),
-            _ => self.stride(parameter, rng.as_mut()),
+            Activity::Jumping => {
+                let habit = rng.map_or(self.habit.clone(), |mut rng| self.habit.varied(0.25, &mut rng));
+                jumping::jump(self, &tracks, &habit, parameter)
+            }
+            _ => self.stride(&tracks, parameter, rng.map_or(1.0, |mut rng| 1.0 + 0.01 * normal(&mut rng))),
         };
         Cycle {
             subject: self.name.clone(),
@@ -112,32 +133,16 @@ impl SyntheticSubject {
         }
     }
 
-    fn stride(&self, speed: f64, rng: Option<&mut ChaCha12Rng>) -> (Vec<Angles>, Vec<RootSample>, f64) {
+    /// One walking or running cycle, `longer` times the subject's usual duration.
+    fn stride(&self, tracks: &Tracks, speed: f64, longer: f64) -> (Vec<Angles>, Vec<RootSample>, f64) {
         let rv = speed / self.hip_height_m;
-        let running = self.activity == Activity::Running;
-        let (mut tracks, frequency_hz) = if running {
-            (self.style.tracks(rv, running::REFERENCE_RV, true, running::population), running::frequency_hz(rv))
+        let gait = if self.activity == Activity::Running {
+            running::gait(speed, rv, longer / (self.tempo * running::frequency_hz(rv)))
         } else {
-            (self.style.tracks(rv, walking::REFERENCE_RV, true, walking::population), walking::frequency_hz(rv))
+            walking::gait(speed, rv, longer / (self.tempo * walking::frequency_hz(rv)))
         };
-        let mut cycle_s = 1.0 / (self.tempo * frequency_hz);
-        if let Some(rng) = rng {
-            add_cycle_noise(&mut tracks, rng);
-            cycle_s *= 1.0 + 0.01 * normal(rng);
-        }
-        let gait = if running { running::gait(speed, rv, cycle_s) } else { walking::gait(speed, cycle_s) };
-        let (angles, root) = stride::cycle(self, &tracks, &gait);
-        (angles, root, cycle_s)
-    }
-
-    fn jump(&self, length: f64, rng: Option<&mut ChaCha12Rng>) -> (Vec<Angles>, Vec<RootSample>, f64) {
-        let mut tracks = self.style.tracks(length / self.hip_height_m, jumping::REFERENCE, false, jumping::population);
-        let mut habit = self.habit.clone();
-        if let Some(rng) = rng {
-            add_cycle_noise(&mut tracks, rng);
-            habit = habit.varied(0.25, rng);
-        }
-        jumping::jump(self, &tracks, &habit, length)
+        let (angles, root) = stride::cycle(self, tracks, &gait);
+        (angles, root, gait.cycle_s)
     }
 }
 
@@ -166,8 +171,7 @@ pub fn subjects(activity: Activity) -> u64 {
 pub fn database(activity: Activity) -> Vec<Cycle> {
     let of_subject = |seed: u64| {
         let subject = subject(activity, seed);
-        let grid = parameters(activity).into_iter().flat_map(|p| (0..REPEATS).map(move |r| (p, r)));
-        grid.map(|(parameter, repeat)| subject.cycle(parameter, repeat)).collect::<Vec<_>>()
+        parameters(activity).into_iter().flat_map(|parameter| subject.cycles(parameter)).collect::<Vec<_>>()
     };
     let by_subject: Vec<_> = (1..=subjects(activity)).into_par_iter().map(of_subject).collect();
     by_subject.into_iter().flatten().collect()

@@ -2,9 +2,9 @@
 //!
 //! Hip, knee and ankle in the sagittal plane: Fourier series of the mean curves of 23 recreational runners at about
 //! 2.5 m/s, "BMC-RIC running" by R. Fukuchi, M. Duarte and R. Ferber (github.com/regifukuchi/BMC-RIC-running-biomechanics,
-//! CC BY 4.0, commit 2daebfed; algorithms.md 3.8). Changes made: mean over the subjects, signs, a series of 6 harmonics.
+//! CC BY 4.0, commit 2daebfed). Changes made: mean over the subjects, signs, a series of 6 harmonics.
 //! Speed enters as the equivalent speed k in km/h of a person with H = 0.87 m: hip range and knee peak grow by 2.5 degrees
-//! per km/h, the stance share falls from 0.42 at 6 to 0.35 at 12 km/h, cadence f = 1.05 (v/H)^0.2 Hz (3.2). The root's
+//! per km/h, the stance share falls from 0.42 at 6 to 0.35 at 12 km/h, cadence f = 1.05 (v/H)^0.2 Hz. The root's
 //! height is ballistic in flight. Pelvis, trunk and arms are own curves (elbows near 90 degrees).
 //! Fails well outside 5 to 14 km/h. Checked: peaks against the source's, gravity in flight, feet on and off the floor.
 

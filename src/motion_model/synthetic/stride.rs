@@ -15,17 +15,23 @@ use crate::math::rotation::log;
 use crate::motion_model::cycle::{RootSample, SAMPLES};
 
 /// Harmonics kept of the root's path: fewer lose the dip at heel strike, more keep the jitter of changing contact points.
-const ROOT_HARMONICS: usize = 6;
+const ROOT_HARMONICS: usize = 8;
 /// Share of the feet's own surging that the root follows: the published curves alone would halve the speed at heel
 /// strike, where people lose a tenth.
 const SURGE: f64 = 0.3;
+/// Long strides of walkers reach back more than forward: shift of the hip, degrees per unit of gain.
+const FARTHER_BACK_DEG: f64 = 5.0;
 /// Weights of hip, knee and ankle in keeping the toes on the floor: more ankle leaves the foot standing on its tip.
 const WILLING: Vector3<f64> = Vector3::new(1.0, 1.5, 0.25);
 /// Shares of hip flexion, knee flexion and dorsiflexion in lifting a swinging foot.
-const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 1.0);
+const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 0.50);
 const LIFT_HEEL: Vector3<f64> = Vector3::new(0.5, 1.0, 0.0);
 /// How far the ankle stretches at push-off, radians.
 const PLANTARFLEXION_LIMIT: f64 = 0.55;
+/// How deep a walker's foot may sink into the floor before the knee gives: less makes straight knees jerk.
+const SINKS_M: f64 = 0.008;
+/// Where the iterations that place a foot stop.
+const CLOSE_ENOUGH_M: f64 = 1e-4;
 /// How much lower than at take-off a runner lands at most.
 const MOST_DROP_M: f64 = 0.05;
 /// A leg that carries does not stretch beyond this, radians.
@@ -61,7 +67,7 @@ pub(super) fn cycle(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait) ->
     let mut gain = 1.0;
     let mut angles = angles(subject, tracks, gait, gain);
     let mut path = leading_path(subject, gait, &angles);
-    for _ in 0..3 {
+    for _ in 0..2 {
         gain *= (gait.stride_m / path.stride_m).clamp(0.5, 2.0);
         angles = self::angles(subject, tracks, gait, gain);
         path = leading_path(subject, gait, &angles);
@@ -141,15 +147,15 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
     let ahead = |k: usize| path.ahead_m[at(k)] + path.stride_m * ((strike + k) / SAMPLES) as f64;
     let flat: Vec<usize> = (0..SAMPLES).filter(|&k| (gait.laid_flat.1..gait.heel_rises.0).contains(&phase(k))).collect();
     let toe_z = flat.iter().map(|&k| ahead(k) + subject.sole(&angles[at(k)], side).0[2].z).sum::<f64>() / flat.len() as f64;
-    let turns: Vec<Vector3<f64>> = (0..=(gait.support * SAMPLES as f64) as usize)
-        .map(|k| {
-            let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
-            let target = [toe_z - ahead(k), -path.height_m[at(k)]];
-            let hold = hold_flat(subject, &angles[at(k)], side, phase(k), target, gait);
-            let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait) } else { hold };
-            hold.lerp(&stand, rise)
-        })
-        .collect();
+    let correction = |k: usize| {
+        let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
+        let target = [toe_z - ahead(k), -path.height_m[at(k)]];
+        let hold = hold_flat(subject, &angles[at(k)], side, phase(k), target, gait);
+        let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait) } else { hold };
+        hold.lerp(&stand, rise)
+    };
+    let turns: Vec<_> = (0..=(gait.support * SAMPLES as f64) as usize).map(correction).collect();
+    let turns = smoothed(&turns);
     let (first, last) = (turns[0], turns[turns.len() - 1]);
     for k in 0..SAMPLES {
         let t = phase(k);
@@ -160,7 +166,15 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
     }
 }
 
-/// Turn of the hip (and of the knee in running, whose root moves by its own law), undone at the ankle, that puts the toe
+/// Mean over seven neighbours, near ones more: a stretched leg and a bent one may both reach, and the change from one to the
+/// other takes time.
+fn smoothed(turns: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
+    let weights = [1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0];
+    let at = |k: usize| turns[k.saturating_sub(3).min(turns.len() - 1)];
+    (0..turns.len()).map(|k| weights.iter().enumerate().map(|(j, w)| at(k + j) * (w / 16.0)).sum()).collect()
+}
+
+/// Turn of the hip (and of the knee, as far as the root's path asks for it), undone at the ankle, that puts the toe
 /// tip at `target` z, or the heel where it must be for that, and the lowest sole point at its y.
 fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
     let toe_share = smooth_step(0.03, 0.12, t);
@@ -170,15 +184,21 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
         turn(&mut angles.sides[side], &of_hip_and_knee(v));
         let [heel, ball, toe] = subject.sole(&angles, side).0;
         let z = toe_share * toe.z + (1.0 - toe_share) * (heel.z + FOOT_LENGTH * subject.stature_m) - target[0];
-        Vector2::new(z, heel.y.min(ball.y).min(toe.y) - target[1])
+        let sinks_m = if gait.bounces { 0.0 } else { SINKS_M };
+        Vector2::new(z, heel.y.min(ball.y).min(toe.y) + sinks_m - target[1])
     };
     let mut v = Vector2::zeros();
     for _ in 0..6 {
         let here = miss(&v);
+        // A walker's root follows the leg: the knee only gives where the foot would sink deep.
+        let knee_gives = gait.bounces || here.y < 0.0 || v.y > 0.0;
+        if here.x.abs() < CLOSE_ENOUGH_M && (!knee_gives || here.y.abs() < CLOSE_ENOUGH_M) {
+            break;
+        }
         let by_hip = (miss(&(v + Vector2::x() * 1e-4)) - here) / 1e-4;
-        let most = KNEE_LIMIT - angles.sides[side].knee;
+        let most = if gait.bounces { KNEE_LIMIT - angles.sides[side].knee } else { 0.0 };
         let mut step = Vector2::new(here.x / by_hip.x.max(0.3 * subject.hip_height_m), 0.0);
-        if gait.bounces {
+        if knee_gives {
             let by_knee = (miss(&(v + Vector2::y() * 1e-4)) - here) / 1e-4;
             let jacobian = Matrix2::from_columns(&[by_hip, by_knee]);
             let normal = jacobian.transpose() * jacobian + Matrix2::identity() * 1e-4;
@@ -193,19 +213,22 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
     of_hip_and_knee(&v)
 }
 
-/// Turns of hip, knee and ankle with the smallest weighted norm that put the toe tip at `target` z, and the lower of ball
-/// and toe tip at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher.
+/// Turns of hip, knee and ankle with the smallest weighted norm that put the toe tip at `target` z, and the lowest sole
+/// point at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher.
 fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
     let miss = |by: &Vector3<f64>| {
         let mut angles = *angles;
         turn(&mut angles.sides[side], by);
         bend_toes(subject, &mut angles, side, gait.heel_rises.1.min(gait.support), gait);
-        let [_, ball, toe] = subject.sole(&angles, side).0;
-        Vector2::new(toe.z - target[0], ball.y.min(toe.y) - target[1])
+        let [heel, ball, toe] = subject.sole(&angles, side).0;
+        Vector2::new(toe.z - target[0], heel.y.min(ball.y).min(toe.y) - target[1])
     };
     let mut by = Vector3::zeros();
     for _ in 0..8 {
         let here = miss(&by);
+        if here.norm() < CLOSE_ENOUGH_M {
+            break;
+        }
         let jacobian = Matrix2x3::from_columns(&[0, 1, 2].map(|k| (miss(&(by + Vector3::ith(k, 1e-4))) - here) / 1e-4));
         let spread = jacobian * Matrix3::from_diagonal(&WILLING);
         let Some(inverse) = (spread * jacobian.transpose() + Matrix2::identity() * 1e-4).try_inverse() else { break };
@@ -227,8 +250,8 @@ fn turn(leg: &mut Side, by: &Vector3<f64>) {
 fn clear_floor(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: usize, gait: &Gait) {
     let lowest = |angles: &Angles| {
         let [heel, ball, toe] = subject.sole(angles, side).0.map(|p| p.y);
-        // A walker's heel comes down by itself at the end of the swing; dorsiflexion is for the rest of the foot.
-        if heel < ball.min(toe) { (heel + if gait.bounces { 0.0 } else { gait.clearance_m }, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
+        // A walker's heel comes down by itself at the end of the swing, and dorsiflexion would only lower it.
+        if gait.bounces && heel < ball.min(toe) { (heel, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
     };
     for _ in 0..2 {
         let lift = |i: usize| {
@@ -268,13 +291,15 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -
         let mut sample = *sample;
         for side in 0..2 {
             let hip = track(Channel::HipFlexion, side);
-            sample[hip] = mean[hip] + gain * (sample[hip] - mean[hip]);
+            sample[hip] = mean[hip] + gain * (sample[hip] - mean[hip]) - if gait.bounces { 0.0 } else { FARTHER_BACK_DEG * (gain - 1.0) };
         }
         let mut angles = Angles::from_tracks(&sample, &subject.offsets);
         for side in 0..2 {
             let sign = if side == 0 { 1.0 } else { -1.0 };
+            // A standing foot does not turn.
+            angles.sides[side].toe_out = -mean[track(Channel::HipRotation, side)].to_radians();
             let adduction = sample[track(Channel::HipAdduction, side)] - mean[track(Channel::HipAdduction, side)];
-            let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.3 * adduction.to_radians();
+            let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.1 * adduction.to_radians();
             for _ in 0..2 {
                 let [heel, _, toe] = subject.sole(&angles, side).0;
                 angles.sides[side].leg_lateral += foot_x - 0.5 * (heel.x + toe.x) / subject.hip_height_m;

@@ -1,4 +1,4 @@
-//! What makes synthetic people differ from one another, and their cycles from one cycle to the next (algorithms.md 3.9).
+//! What makes synthetic people differ from one another, and their cycles from one cycle to the next.
 //!
 //! Every track (one anatomical angle of one side, or of the trunk) of a subject keeps, at all speeds,
 //!   y(t) = m + g (f(t + τ, s_ref + σ (s − s_ref)) − m) + o + Σ_{k≤3} a_k cos 2πkt + b_k sin 2πkt          (1)
