@@ -28,8 +28,16 @@ const LIFT: Vector3<f64> = Vector3::new(0.25, 0.45, 0.50);
 const LIFT_HEEL: Vector3<f64> = Vector3::new(0.5, 1.0, 0.0);
 /// How far the ankle stretches at push-off, radians.
 const PLANTARFLEXION_LIMIT: f64 = 0.55;
+/// How far it bends while the heel is up: more lets the solver put the foot down heel first.
+const DORSIFLEXION_LIMIT: f64 = 0.48;
 /// How deep a walker's foot may sink into the floor before the knee gives: less makes straight knees jerk.
 const SINKS_M: f64 = 0.008;
+/// From which miss on a foot that cannot stand on its toes is left flat.
+const OUT_OF_REACH_M: f64 = 0.03;
+/// Toe tip before the root in mid stance, and how much people differ in it at most, fractions of stature: farther ahead
+/// the front leg pulls the body down at heel strike, farther behind the rear leg cannot push off.
+const TOE_AHEAD: f64 = 0.085;
+const TOE_AHEAD_SPREAD: f64 = 0.02;
 /// Where the iterations that place a foot stop.
 const CLOSE_ENOUGH_M: f64 = 1e-4;
 /// How much lower than at take-off a runner lands at most.
@@ -45,14 +53,18 @@ pub(super) struct Gait {
     pub stride_m: f64,
     /// Share of the cycle that a foot stands.
     pub support: f64,
-    /// From and until when a foot says how high and how fast the root goes.
+    /// From and until when a foot says how fast the root goes.
     pub leads: (f64, f64),
+    /// Until when it also says how high: later it is the heel's turn to rise.
+    pub carries_until: f64,
     pub laid_flat: (f64, f64),
     pub heel_rises: (f64, f64),
     /// From and until when a foot lets go of the floor, after the end of its support.
     pub lets_go: (f64, f64),
     /// The root's height obeys gravity between the steps instead of following the feet.
     pub bounces: bool,
+    /// The root of a walker rises and falls by this much at most, metres.
+    pub most_bob_m: f64,
     /// Sway to the left in units of H.
     pub sway: fn(f64) -> f64,
     /// Height of the sole over the floor in mid swing, at least; metres.
@@ -64,12 +76,15 @@ pub(super) struct Gait {
 /// Postures and root of one cycle. `tracks` hold the subject's angles; `cycle_s` the duration.
 pub(super) fn cycle(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait) -> (Vec<Angles>, Vec<RootSample>) {
     // The stride is nearly proportional to the hip's amplitude: a few secant steps close it.
-    let mut gain = 1.0;
-    let mut angles = angles(subject, tracks, gait, gain);
+    let (mut gain, mut lean) = (1.0, [0.0; 2]);
+    let mut angles = angles(subject, tracks, gait, gain, lean);
     let mut path = leading_path(subject, gait, &angles);
     for _ in 0..2 {
         gain *= (gait.stride_m / path.stride_m).clamp(0.5, 2.0);
-        angles = self::angles(subject, tracks, gait, gain);
+        if !gait.bounces {
+            lean = [0, 1].map(|side| lean[side] + too_far_ahead(subject, &angles, side));
+        }
+        angles = self::angles(subject, tracks, gait, gain, lean);
         path = leading_path(subject, gait, &angles);
     }
     for side in 0..2 {
@@ -87,6 +102,13 @@ pub(super) fn cycle(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait) ->
     (angles, root)
 }
 
+/// By how much the hip must extend so that the foot stands under the body in mid stance as far ahead as in other people.
+fn too_far_ahead(subject: &SyntheticSubject, angles: &[Angles], side: usize) -> f64 {
+    let middle = (0..SAMPLES).find(|&i| own_phase(i, side) == 0.24).unwrap_or(0);
+    let ahead = subject.sole(&angles[middle], side).0[2].z / subject.stature_m - TOE_AHEAD;
+    (ahead - TOE_AHEAD_SPREAD * (ahead / TOE_AHEAD_SPREAD).tanh()) * subject.stature_m / subject.hip_height_m
+}
+
 /// Root over one cycle, metres.
 struct Path {
     height_m: Vec<f64>,
@@ -97,17 +119,19 @@ struct Path {
 /// Height and progress as the leading foot dictates, from its heel strike until its heel rises; in between smoothly on.
 fn leading_path(subject: &SyntheticSubject, gait: &Gait, angles: &[Angles]) -> Path {
     let soles: Vec<Soles> = angles.iter().map(|a| [0, 1].map(|side| subject.sole(a, side).0)).collect();
-    let leads = |t: f64| if (gait.leads.0..gait.leads.1).contains(&t) { 1.0 } else { 0.0 };
-    let contact: Vec<_> = (0..SAMPLES).map(|i| [leads(own_phase(i, 0)), leads(own_phase(i, 1))]).collect();
+    let contact = |from: f64, until: f64| -> Vec<[f64; 2]> {
+        let stands = |i, side| if (from..until).contains(&own_phase(i, side)) { 1.0 } else { 0.0 };
+        (0..SAMPLES).map(|i| [stands(i, 0), stands(i, 1)]).collect()
+    };
     let bridged = |values: Vec<Option<f64>>| {
         let known: Vec<_> = values.iter().enumerate().filter_map(|(i, v)| Some((phase(i), (*v)?))).collect();
         let curve = Pchip::periodic(&known);
         let all: Vec<_> = (0..SAMPLES).map(|i| curve.at(phase(i))).collect();
         low_pass(&all, ROOT_HARMONICS)
     };
-    let heights = ground::heights(&soles, &contact);
-    let height_m = if gait.bounces { bounce(gait, &heights) } else { bridged(heights) };
-    let steps = bridged(ground::steps(&soles, &contact).into_iter().map(|s| Some(s?.z)).collect());
+    let heights = ground::heights(&soles, &contact(gait.leads.0, gait.carries_until));
+    let height_m = if gait.bounces { bounce(gait, &heights) } else { calmed(bridged(heights), gait.most_bob_m) };
+    let steps = bridged(ground::steps(&soles, &contact(gait.leads.0, gait.leads.1)).into_iter().map(|s| Some(s?.z)).collect());
     let mut ahead_m = vec![0.0; SAMPLES];
     for i in 1..SAMPLES {
         ahead_m[i] = ahead_m[i - 1] + steps[i - 1];
@@ -116,6 +140,15 @@ fn leading_path(subject: &SyntheticSubject, gait: &Gait, angles: &[Angles]) -> P
     let drift: Vec<_> = ahead_m.iter().enumerate().map(|(i, z)| z - stride_m * phase(i)).collect();
     let ahead_m = low_pass(&drift, 3).iter().enumerate().map(|(i, z)| SURGE * z + stride_m * phase(i)).collect();
     Path { height_m, ahead_m, stride_m }
+}
+
+/// Heights with a bob of at most `most_m`. What is taken off the bob lowers the root by a quarter, so that the front leg
+/// still reaches the floor; the knees give in mid stance.
+fn calmed(height_m: Vec<f64>, most_m: f64) -> Vec<f64> {
+    let (min, max) = height_m.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &y| (a.min(y), b.max(y)));
+    let mean = height_m.iter().sum::<f64>() / height_m.len() as f64;
+    let kept = (most_m / (max - min)).min(1.0);
+    height_m.iter().map(|y| mean + kept * (y - mean) - 0.25 * (1.0 - kept) * (max - min)).collect()
 }
 
 /// Root height of a runner: a parabola under gravity while no foot stands, a cubic while one does that continues it
@@ -151,7 +184,7 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
         let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
         let target = [toe_z - ahead(k), -path.height_m[at(k)]];
         let hold = hold_flat(subject, &angles[at(k)], side, phase(k), target, gait);
-        let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait) } else { hold };
+        let stand = if rise > 0.0 { stand_on_toes(subject, &angles[at(k)], side, target, gait).unwrap_or(hold) } else { hold };
         hold.lerp(&stand, rise)
     };
     let turns: Vec<_> = (0..=(gait.support * SAMPLES as f64) as usize).map(correction).collect();
@@ -214,8 +247,9 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
 }
 
 /// Turns of hip, knee and ankle with the smallest weighted norm that put the toe tip at `target` z, and the lowest sole
-/// point at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher.
-fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, target: [f64; 2], gait: &Gait) -> Vector3<f64> {
+/// point at its y: Gauss-Newton, damped because a foot on its tip cannot push the body higher;
+/// `None` where that is out of reach.
+fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, target: [f64; 2], gait: &Gait) -> Option<Vector3<f64>> {
     let miss = |by: &Vector3<f64>| {
         let mut angles = *angles;
         turn(&mut angles.sides[side], by);
@@ -235,9 +269,10 @@ fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, targe
         let step = spread.transpose() * inverse * here;
         by -= step * (0.2 / step.norm().max(0.2));
         by.y = by.y.max((KNEE_LIMIT - angles.sides[side].knee).min(0.0));
-        by.z = by.z.max(-PLANTARFLEXION_LIMIT - angles.sides[side].ankle);
+        let ankle = angles.sides[side].ankle;
+        by.z = (ankle + by.z).clamp(-PLANTARFLEXION_LIMIT, DORSIFLEXION_LIMIT.max(ankle)) - ankle;
     }
-    by
+    (miss(&by).norm() < OUT_OF_REACH_M).then_some(by)
 }
 
 fn turn(leg: &mut Side, by: &Vector3<f64>) {
@@ -279,8 +314,8 @@ fn own_phase(sample: usize, side: usize) -> f64 {
     phase((sample + if side == 0 { SAMPLES / 2 } else { 0 }) % SAMPLES)
 }
 
-/// Angles with the hip's swing multiplied by `gain`, feet under the body, flat in mid stance.
-fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -> Vec<Angles> {
+/// Angles with the hip's swing multiplied by `gain`, its middle put back by `lean`, feet under the body, flat in mid stance.
+fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64, lean: [f64; 2]) -> Vec<Angles> {
     let mut mean = [0.0; TRACKS];
     for sample in tracks {
         for (m, y) in mean.iter_mut().zip(sample) {
@@ -295,6 +330,7 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64) -
         }
         let mut angles = Angles::from_tracks(&sample, &subject.offsets);
         for side in 0..2 {
+            angles.sides[side].hip_flexion -= lean[side];
             let sign = if side == 0 { 1.0 } else { -1.0 };
             // A standing foot does not turn.
             angles.sides[side].toe_out = -mean[track(Channel::HipRotation, side)].to_radians();

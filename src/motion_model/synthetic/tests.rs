@@ -94,7 +94,7 @@ fn a_person_keeps_body_and_style_and_another_seed_is_another_person() {
 
 #[test]
 fn rotations_are_continuous_and_cycles_close() {
-    for (activity, most_deg) in ALL.into_iter().zip([16.0, 18.0, 32.0]) {
+    for (activity, most_deg) in ALL.into_iter().zip([13.0, 18.0, 32.0]) {
         for cycle in database(activity) {
             let last = if activity.is_cyclic() { SAMPLES } else { SAMPLES - 1 };
             for i in 0..last {
@@ -104,7 +104,7 @@ fn rotations_are_continuous_and_cycles_close() {
                     assert!(step_deg < most_deg, "{activity:?} {} {} joint {k} sample {i}: {step_deg}", cycle.subject, cycle.parameter);
                 }
                 let step = cycle.root[(i + 1) % SAMPLES].position - cycle.root[i].position;
-                assert!(step.norm() < 0.08, "{activity:?} {} root {i}: {step:?}", cycle.subject);
+                assert!(step.norm() < 0.12, "{activity:?} {} root {i}: {step:?}", cycle.subject);
             }
         }
     }
@@ -114,8 +114,8 @@ fn rotations_are_continuous_and_cycles_close() {
 fn walking_feet_stand_on_the_floor_and_do_not_slide() {
     for seed in 1..=9 {
         let subject = subject(Activity::Walking, seed);
-        for kmh in [3.0, 5.0, 7.0] {
-            let cycle = subject.cycle(kmh * KMH, 0);
+        for (kmh, repeat) in (0..9).flat_map(|k| [(3.0 + 0.5 * f64::from(k), 0), (3.0 + 0.5 * f64::from(k), 3)]) {
+            let cycle = subject.cycle(kmh * KMH, repeat);
             let placements = placements(&subject, &cycle);
             let mut slides = Vec::new();
             for (i, heights) in foot_heights(&subject, &cycle).iter().enumerate() {
@@ -123,7 +123,7 @@ fn walking_feet_stand_on_the_floor_and_do_not_slide() {
                     let t = phase_from_strike(i, side);
                     assert!(height > -0.03, "{seed} at {kmh} side {side} phase {t}: {height}");
                     if (0.02..0.48).contains(&t) {
-                        assert!(height.abs() < 0.03, "{seed} at {kmh} side {side} phase {t}: {height}");
+                        assert!(height.abs() < 0.045, "{seed} at {kmh} side {side} phase {t}: {height}");
                     }
                     if (0.12..0.45).contains(&t) && i + 1 < SAMPLES {
                         let toe = |i: usize| sole(&subject, &placements[i], side)[2];
@@ -133,7 +133,7 @@ fn walking_feet_stand_on_the_floor_and_do_not_slide() {
                 }
             }
             let (mean, most) = (slides.iter().sum::<f64>() / slides.len() as f64, range(&slides).1);
-            assert!(mean < 0.08 && most < 0.30, "{seed} at {kmh}: slides at {mean} of the speed, at most {most}");
+            assert!(mean < 0.10 && most < 0.50, "{seed} at {kmh}: slides at {mean} of the speed, at most {most}");
         }
     }
 }
@@ -399,7 +399,7 @@ fn mean_walkers_lie_within_the_spread_of_people() {
         // Their hip angle is measured against the pelvis' own plane, tilted forward by this much in standing.
         let tilt = row("pelvis_ant_tilt", beta).2[0];
         for (ours, (channel, offset, most)) in
-            ours.iter().zip([("hip_flexion", tilt, 0.8), ("knee_flexion", 0.0, 1.35), ("ankle_dorsiflexion", 0.0, 1.35)])
+            ours.iter().zip([("hip_flexion", tilt, 0.7), ("knee_flexion", 0.0, 1.2), ("ankle_dorsiflexion", 0.0, 1.35)])
         {
             let (_, _, coefficients, spread) = row(channel, beta);
             let (rms, largest) = deviation(ours, |t| series(coefficients, t) - offset);
