@@ -12,7 +12,8 @@
 //!   ∂r = −Σ_b ω_b ∇d_b · v_b(x) / |∇d_eff|,  ω_b = exp(−2 d_b)/F.                                                (3)
 //!
 //! Limbs are chains of primitives spaced by their own semi-axis, where Σ exp(−2 (y − y_i)²/L²) ≈ √(π/2): a skin radius R
-//! needs the lateral semi-axis R/√(½ ln √(2π)) = R/0.678. Neighbouring limbs blend, so thighs swell where they touch.
+//! needs the lateral semi-axis R/√(½ ln √(2π)) = R/0.678. Chains stop short of knees and elbows by half their spacing, else
+//! joints would swell by a third. Neighbouring limbs blend, so thighs swell where they touch.
 //! Checked against central differences, closed forms and ray casting.
 
 use nalgebra::{Matrix3, Vector3};
@@ -70,25 +71,25 @@ fn template() -> Vec<Chain> {
     use Joint::*;
     let chain = |node, axis, from, to, radii, count| Chain { node, axis, from, to, radii, count };
     let mut chains = vec![
-        chain(Sacroiliac, 1, [0.0, -0.030, -0.009], [0.0, 0.030, -0.002], ([0.047, 0.066], [0.108, 0.070]), 3),
-        chain(Vl5, 1, [0.0, 0.020, 0.005], [0.0, 0.070, 0.005], ([0.070, 0.056], [0.096, 0.073]), 3),
-        chain(Vt10, 1, [0.0, 0.005, 0.014], [0.0, 0.060, 0.012], ([0.088, 0.065], [0.091, 0.085]), 3),
-        chain(Vt5, 1, [0.0, 0.025, 0.015], [0.0, 0.070, 0.006], ([0.080, 0.074], [0.060, 0.055]), 2),
-        chain(Vt1, 1, [0.0, 0.0, 0.007], [0.0, 0.060, 0.011], ([0.031, 0.043], [0.036, 0.036]), 3),
-        chain(Skullbase, 1, [0.0, 0.020, 0.018], [0.0, 0.063, 0.008], ([0.034, 0.046], [0.040, 0.054]), 2),
+        chain(Sacroiliac, 1, [0.0, -0.030, -0.001], [0.0, 0.030, -0.001], ([0.050, 0.065], [0.111, 0.071]), 3),
+        chain(Vl5, 1, [0.0, 0.020, 0.005], [0.0, 0.070, 0.006], ([0.070, 0.056], [0.096, 0.073]), 3),
+        chain(Vt10, 1, [0.0, 0.005, 0.014], [0.0, 0.060, 0.013], ([0.088, 0.065], [0.091, 0.085]), 3),
+        chain(Vt5, 1, [0.0, 0.025, 0.015], [0.0, 0.070, 0.007], ([0.080, 0.074], [0.060, 0.055]), 2),
+        chain(Vt1, 1, [0.0, 0.0, 0.006], [0.0, 0.055, 0.013], ([0.034, 0.042], [0.034, 0.034]), 3),
+        chain(Skullbase, 1, [0.0, -0.004, 0.018], [0.0, 0.066, 0.008], ([0.036, 0.044], [0.042, 0.054]), 3),
     ];
     for (side, [hip, knee, ankle, midtarsal, clavicle, shoulder, elbow, wrist]) in [
         (1.0, [LHip, LKnee, LAnkle, LMidtarsal, LAcromioclavicular, LShoulder, LElbow, LWrist]),
         (-1.0, [RHip, RKnee, RAnkle, RMidtarsal, RAcromioclavicular, RShoulder, RElbow, RWrist]),
     ] {
         chains.extend([
-            chain(hip, 1, [0.0, -0.035, 0.0], [0.0, -0.245, 0.0], ([0.055, 0.058], [0.041, 0.043]), 6),
-            chain(knee, 1, [0.0, -0.030, -0.004], [0.0, -0.235, -0.004], ([0.039, 0.041], [0.030, 0.031]), 5),
+            chain(hip, 1, [0.0, -0.035, 0.0], [0.0, -0.225, 0.0], ([0.055, 0.058], [0.039, 0.041]), 6),
+            chain(knee, 1, [0.0, -0.025, -0.003], [0.0, -0.235, -0.004], ([0.038, 0.040], [0.030, 0.031]), 5),
             chain(ankle, 2, [0.0, -0.016, -0.022], [0.0, -0.016, 0.040], ([0.024, 0.024], [0.026, 0.020]), 3),
             chain(midtarsal, 2, [0.0, -0.002, 0.012], [0.0, -0.004, 0.042], ([0.026, 0.016], [0.024, 0.013]), 2),
             chain(clavicle, 0, [-0.030 * side, -0.018, 0.0], [0.008 * side, -0.020, 0.0], ([0.034, 0.036], [0.032, 0.034]), 2),
-            chain(shoulder, 1, [0.0, -0.015, 0.0], [0.0, -0.155, 0.0], ([0.029, 0.032], [0.024, 0.026]), 4),
-            chain(elbow, 1, [0.0, -0.010, 0.0], [0.0, -0.145, 0.0], ([0.025, 0.026], [0.018, 0.020]), 4),
+            chain(shoulder, 1, [0.0, -0.015, 0.0], [0.0, -0.145, 0.0], ([0.029, 0.032], [0.024, 0.026]), 4),
+            chain(elbow, 1, [0.0, -0.015, 0.0], [0.0, -0.145, 0.0], ([0.025, 0.026], [0.018, 0.020]), 4),
             chain(wrist, 1, [0.0, -0.020, 0.0], [0.0, -0.080, 0.004], ([0.014, 0.023], [0.012, 0.019]), 3),
         ]);
     }
@@ -342,7 +343,13 @@ mod tests {
         }
         let placement = place(&shape.offsets(), &pose);
         let surface = posed(&shape, &pose);
-        for (node, along, expected) in [(Joint::LHip, 0.6, 0.0477), (Joint::LKnee, 0.5, 0.0349), (Joint::LShoulder, 0.5, 0.0266)] {
+        for (node, along, expected) in [
+            (Joint::LHip, 0.6, 0.0456),
+            (Joint::LKnee, 0.5, 0.0343),
+            (Joint::LShoulder, 0.5, 0.0265),
+            (Joint::LKnee, 0.0, 0.0385),
+            (Joint::LElbow, 0.0, 0.0245),
+        ] {
             let k = node as usize;
             let end = placement.positions[k + 1];
             let at = placement.positions[k] + (end - placement.positions[k]) * along;

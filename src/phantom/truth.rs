@@ -173,9 +173,8 @@ mod tests {
         assert!(errors.swapped_over_straight > 1.0);
         // Exchanged legs are told.
         let mut exchanged = truth.positions;
-        for (l, r) in [(LKnee, RKnee), (LAnkle, RAnkle)] {
-            exchanged.swap(l as usize, r as usize);
-        }
+        exchanged.swap(LKnee as usize, RKnee as usize);
+        exchanged.swap(LAnkle as usize, RAnkle as usize);
         assert!(joint_errors(&[exchanged], &[truth.positions]).swapped_over_straight < 1.0);
     }
 }

@@ -1,7 +1,7 @@
 //! Errors of everything that was recovered and generated.
 
 use anyhow::{Result, bail};
-use muybridge::body::{Pose, PosedSurface, Surface, place};
+use muybridge::body::{Joint, Length, Pose, PosedSurface, Shape, Surface, place};
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::synthetic::REPEATS;
 use muybridge::motion_model::{Cycle, Model, SAMPLES};
@@ -19,9 +19,22 @@ const POINTS: usize = 2000;
 /// A point farther from the skin is none of the body's, metres.
 const OFF_BODY_M: f64 = 0.05;
 
+/// What errors are set beside; [`NOTES`] says what they are.
+const MODEL: &str = "model alone";
+const TRUE_STYLE: &str = "true style";
+const UNCHANGED: &str = "unchanged";
+const AVERAGE: &str = "average person";
+
+/// What the table's words mean.
+pub const NOTES: &str = "
+Angles are included angles at joint centres, means of both sides; joints at new speeds: pelvis moved together.
+model alone: the true cycle as the model's components show it; true style: generated from the true cycle's weights;
+unchanged: the recovered motion replayed as filmed; average person: mean of the database's people at that speed.
+";
+
 pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
     let mut rows = cloud_rows(truth, tracked)?;
-    rows.extend(joint_rows(truth, tracked));
+    rows.extend(joint_rows(truth, model, tracked));
     rows.extend(motion_rows(truth, tracked));
     rows.extend(weight_rows(truth, model, tracked));
     rows.extend(speed_rows(truth, model, tracked, generated)?);
@@ -51,21 +64,30 @@ fn cloud_rows(truth: &Truth, tracked: &Tracked) -> Result<Vec<Row>> {
     ])
 }
 
-fn joint_rows(truth: &Truth, tracked: &Tracked) -> Vec<Row> {
+fn joint_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row> {
     let positions = |poses: &[Pose], offsets: &Positions| -> Vec<Positions> { poses.iter().map(|p| place(offsets, p).positions).collect() };
     let found = positions(&tracked.fit.poses, &tracked.fit.shape().offsets());
     let errors = joint_errors(&found, &positions(&truth.poses, &truth.subject.shape().offsets()));
+    let shown = model.model.cycle(own_weights(&model.model, &truth.cycle).as_slice(), "", SPEED_M_S, 1.0, 1.0);
+    let least = against(truth, &shown, &truth.cycle);
     let mut rows = vec![
         Row::new("joints, absolute", 1e3 * errors.absolute_m, "mm"),
-        Row::new("joints, pelvis moved together", 1e3 * errors.root_relative_m, "mm"),
+        Row::new("joints, pelvis moved together", 1e3 * errors.root_relative_m, "mm").beside(MODEL, 1e3 * least.root_relative_m),
     ];
-    rows.extend(ANGLES.iter().zip(errors.angles).map(|((name, _), angle)| Row::new(format!("{name} angle"), angle.to_degrees(), "deg")));
+    for (k, (name, _)) in ANGLES.iter().enumerate() {
+        rows.push(Row::new(format!("{name} angle"), errors.angles[k].to_degrees(), "deg").beside(MODEL, least.angles[k].to_degrees()));
+    }
     rows.push(Row::new("legs, error with sides exchanged over own", errors.swapped_over_straight, ""));
     rows
 }
 
+/// The true weights: all that the model holds.
+fn own_weights(model: &Model, cycle: &Cycle) -> DVector<f64> {
+    model.project(&model.vector_of(cycle))
+}
+
 fn motion_rows(truth: &Truth, tracked: &Tracked) -> Vec<Row> {
-    let fit = &tracked.fit;
+    let (fit, shape) = (&tracked.fit, truth.subject.shape());
     let wrapped = |d: f64| (d + 0.5).rem_euclid(1.0) - 0.5;
     let phases = fit.state.carriers.iter().zip(&truth.phases).map(|(found, phase)| wrapped(found.phase - phase).abs());
     let phase = phases.sum::<f64>() / truth.phases.len() as f64;
@@ -74,8 +96,20 @@ fn motion_rows(truth: &Truth, tracked: &Tracked) -> Vec<Row> {
         Row::new("phase", phase, "cycle"),
         Row::new("speed", 100.0 * (fit.speed_m_s / SPEED_M_S - 1.0).abs(), "%").beside("true m/s", SPEED_M_S),
         Row::new("cadence", 100.0 * (fit.cadence_hz / frequency_hz - 1.0).abs(), "%").beside("true cycles/s", frequency_hz),
-        Row::new("stature", 1e3 * (fit.shape().stature_m - truth.subject.stature_m).abs(), "mm").beside("true m", truth.subject.stature_m),
+        size_row("height", height_m, fit.shape(), &shape),
+        size_row("hip height", Shape::hip_height_m, fit.shape(), &shape),
     ]
+}
+
+fn size_row(quantity: &str, size_m: fn(&Shape) -> f64, found: &Shape, truth: &Shape) -> Row {
+    Row::new(quantity, 1e3 * (size_m(found) - size_m(truth)).abs(), "mm").beside("true mm", 1e3 * size_m(truth))
+}
+
+/// Crown above the floor when standing.
+fn height_m(shape: &Shape) -> f64 {
+    let crown = Joint::Skullbase.end_site().unwrap_or_default() * shape.stature_m * shape.lengths[Length::Head as usize];
+    let up_to = std::iter::successors(Some(Joint::Skullbase), |joint| joint.parent());
+    up_to.map(|joint| shape.offsets()[joint as usize].y).sum::<f64>() + crown.y
 }
 
 /// Distances of equation (6) of the style paper.
@@ -83,7 +117,7 @@ fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row>
     let model = &model.model;
     let found = DVector::from_column_slice(&tracked.fit.state.weights);
     let population = Population::new(model, found.len());
-    let weights = |cycle: &Cycle| model.project(&model.vector_of(cycle)).rows(0, population.components()).into_owned();
+    let weights = |cycle: &Cycle| own_weights(model, cycle).rows(0, population.components()).into_owned();
     let distance = |a: &DVector<f64>, b: &DVector<f64>| Metric::Paper.distance(&population.eigenvalues, a, b);
     let own = weights(&truth.cycle);
     let repeats: Vec<_> = (0..REPEATS).map(|r| weights(&truth.subject.cycle(SPEED_M_S, r))).collect();
@@ -101,29 +135,32 @@ fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row>
 /// The generated cycles against the subject's own true motion at those speeds, on the true body.
 fn speed_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
     let found = &tracked.fit.state.weights;
-    let cycle_of = |weights: &[f64]| model.model.cycle(weights, "", SPEED_M_S, 1.0, 1.0);
-    let true_style = Style::of_cycles(&model.model, &model.hash, std::slice::from_ref(&truth.cycle));
+    let Some(true_style) = Style::of_cycles(&model.model, &model.hash, std::slice::from_ref(&truth.cycle)) else {
+        bail!("the filmed person has no cycle");
+    };
     let mut rows = Vec::new();
     for motion in generated {
         let speed_m_s = motion.kmh / 3.6;
         let wanted = truth.subject.mean_cycle(speed_m_s);
-        let of = |cycle: &Cycle| against(truth, cycle, &wanted);
-        let made = of(&cycle_of(motion.synthesis.weights.as_slice()));
-        let unchanged = of(&cycle_of(found));
-        let average = of(&cycle_of(average_person(&model.model, found.len(), speed_m_s).as_slice()));
-        let mut angle = Row::new(format!("at {} km/h, angles", motion.kmh), made.angle().to_degrees(), "deg")
-            .beside("filmed motion unchanged", unchanged.angle().to_degrees())
-            .beside("average person", average.angle().to_degrees());
-        let mut joints = Row::new(format!("at {} km/h, joints, pelvis moved together", motion.kmh), 1e3 * made.root_relative_m, "mm")
-            .beside("filmed motion unchanged", 1e3 * unchanged.root_relative_m)
-            .beside("average person", 1e3 * average.root_relative_m);
-        if let Some(style) = &true_style {
-            let ideal = of(&cycle_of(at_speed(model, style, speed_m_s)?.weights.as_slice()));
-            angle = angle.beside("from the true style", ideal.angle().to_degrees());
-            joints = joints.beside("from the true style", 1e3 * ideal.root_relative_m);
-        }
-        let cadence = 100.0 * (motion.synthesis.frequency_hz * wanted.duration_s - 1.0).abs();
-        rows.extend([angle, joints, Row::new(format!("at {} km/h, cadence", motion.kmh), cadence, "%")]);
+        let error = |weights: &[f64]| against(truth, &model.model.cycle(weights, "", speed_m_s, 1.0, 1.0), &wanted);
+        let cadence = |frequency_hz: f64| 100.0 * (frequency_hz * wanted.duration_s - 1.0).abs();
+        let from_truth = at_speed(model, &true_style, speed_m_s)?;
+        let made = error(motion.synthesis.weights.as_slice());
+        let beside = [
+            (TRUE_STYLE, error(from_truth.weights.as_slice())),
+            (UNCHANGED, error(found)),
+            (AVERAGE, error(average_person(&model.model, found.len(), speed_m_s).as_slice())),
+        ];
+        let row = |what: &str, unit, of: &dyn Fn(&JointErrors) -> f64| Row {
+            quantity: format!("at {} km/h, {what}", motion.kmh),
+            value: of(&made),
+            unit,
+            beside: beside.iter().map(|(name, errors)| (*name, of(errors))).collect(),
+        };
+        rows.push(row("angles", "deg", &|e| e.angle().to_degrees()));
+        rows.push(row("joints", "mm", &|e| 1e3 * e.root_relative_m));
+        let name = format!("at {} km/h, cadence", motion.kmh);
+        rows.push(Row::new(name, cadence(motion.synthesis.frequency_hz), "%").beside(TRUE_STYLE, cadence(from_truth.frequency_hz)));
     }
     Ok(rows)
 }

@@ -124,7 +124,7 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
         pictures::draw(&folder.join("pictures"), &truth, &model, &tracked, &generated, depth.as_ref())?;
         Ok(rows)
     })?;
-    let text = table::text(&rows, &clock.0);
+    let text = table::text(&rows, errors::NOTES, &clock.0);
     write_atomic(&folder.join("table.txt"), text.as_bytes())?;
     write_atomic(&folder.join("errors.csv"), table::csv(&rows).as_bytes())?;
     write_atomic(&folder.join(MARKER), marker(&truth).as_bytes())?;

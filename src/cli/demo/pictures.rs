@@ -15,6 +15,8 @@ use crate::cli::track::{NamedModel, Tracked};
 /// Figures of one row of the speeds, over this time.
 const FIGURES: usize = 7;
 const SECONDS: f64 = 1.5;
+/// Room around the person in the depth picture.
+const MARGIN_PX: u32 = 60;
 
 pub fn draw(
     folder: &Path,
@@ -27,8 +29,7 @@ pub fn draw(
     report::save(&folder.join("angles.png"), &angles(truth, model, tracked)?)?;
     report::save(&folder.join("speeds.png"), &speeds(made)?)?;
     if let Some(depth) = depth {
-        let (title, range) = ("Depth in the reference camera, middle frame", range(depth));
-        report::save(&folder.join("depth.png"), &report::depth_map(depth, range, title, "m")?)?;
+        report::save(&folder.join("depth.png"), &depth_picture(depth)?)?;
     }
     Ok(())
 }
@@ -60,10 +61,19 @@ fn speeds(made: &[Generated]) -> Result<image::RgbImage> {
     Ok(report::stick_figures(&labelled, FIGURES)?)
 }
 
-/// From the nearest to the farthest depth, without the extreme hundredths.
-fn range(depth: &DepthMap) -> (f64, f64) {
-    let mut values: Vec<f64> = depth.pixels().map(|p| f64::from(p.0[0])).filter(|d| d.is_finite()).collect();
-    values.sort_by(f64::total_cmp);
-    let at = |part: f64| values.get((part * values.len() as f64) as usize).copied().unwrap_or(1.0);
-    (at(0.01), at(0.99))
+/// The person alone, twice as large.
+fn depth_picture(depth: &DepthMap) -> Result<image::RgbImage> {
+    let values = || depth.enumerate_pixels().filter(|(_, _, d)| d.0[0].is_finite());
+    let bounds = |at: fn((u32, u32)) -> u32, size: u32| {
+        let (low, high) = values().map(|(x, y, _)| at((x, y))).fold((size, 0), |(low, high), v| (low.min(v), high.max(v)));
+        (low.saturating_sub(MARGIN_PX), (high + MARGIN_PX).min(size))
+    };
+    let ((left, right), (top, bottom)) = (bounds(|p| p.0, depth.width()), bounds(|p| p.1, depth.height()));
+    let (width, height) = (right.saturating_sub(left).max(1), bottom.saturating_sub(top).max(1));
+    let large = DepthMap::from_fn(2 * width, 2 * height, |x, y| *depth.get_pixel(left + x / 2, top + y / 2));
+    let mut sorted: Vec<f64> = values().map(|(_, _, d)| f64::from(d.0[0])).collect();
+    sorted.sort_by(f64::total_cmp);
+    // Without the extreme hundredths.
+    let at = |part: f64| sorted.get((part * sorted.len() as f64) as usize).copied().unwrap_or(1.0);
+    Ok(report::depth_map(&large, (at(0.01), at(0.99)), "Measured depth, middle frame", "m")?)
 }

@@ -21,19 +21,20 @@ impl Row {
     }
 }
 
-/// Aligned columns.
-pub fn text(rows: &[Row], seconds: &[(&'static str, f64)]) -> String {
-    let mut text = format!("{:<46}{:>9}  {:<6}  {}\n", "error against the truth", "", "", "beside it");
+/// Aligned columns; `notes` stand below the errors.
+pub fn text(rows: &[Row], notes: &str, seconds: &[(&'static str, f64)]) -> String {
+    let mut text = format!("{:<44}{:>9}  {:<6}  {}\n", "error against the truth", "", "", "beside it");
     for row in rows {
         let beside: Vec<_> = row.beside.iter().map(|(name, value)| format!("{name} {}", number(*value))).collect();
-        let line = format!("{:<46}{:>9}  {:<6}  {}", row.quantity, number(row.value), row.unit, beside.join(", "));
+        let line = format!("{:<44}{:>9}  {:<6}  {}", row.quantity, number(row.value), row.unit, beside.join(", "));
         // Writing to a string cannot fail.
         let _ = writeln!(text, "{}", line.trim_end());
     }
+    text.push_str(notes);
     text.push_str("\nseconds per stage\n");
     let total: f64 = seconds.iter().map(|s| s.1).sum();
     for (stage, value) in seconds.iter().chain([&("together", total)]) {
-        let _ = writeln!(text, "{stage:<46}{value:>9.1}  s");
+        let _ = writeln!(text, "{stage:<44}{value:>9.1}  s");
     }
     text
 }
@@ -68,9 +69,9 @@ mod tests {
     fn rows_are_aligned_and_every_comparison_has_its_line() {
         let rows =
             [Row::new("joints, absolute", 31.256, "mm"), Row::new("weights", 0.01234, "rad").beside("spread", 2.0).beside("people", 140.0)];
-        let text = text(&rows, &[("fit", 3.21), ("clouds", 4.0)]);
+        let text = text(&rows, "notes\n", &[("fit", 3.21), ("clouds", 4.0)]);
         let lines: Vec<_> = text.lines().collect();
-        assert_eq!(lines[1].find("31.3"), Some(51));
+        assert_eq!(lines[1].find("31.3"), Some(49));
         assert!(lines[2].contains("0.0123  rad     spread 2.00, people 140"), "{}", lines[2]);
         assert!(lines.last().unwrap().ends_with("7.2  s"));
         let csv = csv(&rows);
