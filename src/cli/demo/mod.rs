@@ -20,12 +20,13 @@ use muybridge::motion_model::{Activity, Cycle};
 use muybridge::phantom::{DepthMap, Scene, Stage, staging};
 use muybridge::rig::Rig;
 use muybridge::style::{Metric, Population, Style};
+use tempfile::TempDir;
 
 use super::check;
 use super::model::default_variance;
 use super::render::{Take, write_session};
 use super::track::{self, NamedModel, Tracked};
-use super::whole::make_readable;
+use super::whole;
 
 /// A person the embedded database (seeds 1 to 9) does not hold.
 const SUBJECT: u64 = 1000;
@@ -84,11 +85,10 @@ impl Clock {
 }
 
 pub fn run(args: &DemoArgs) -> Result<()> {
-    let parent = replaceable(&args.output)?;
-    let partial =
-        tempfile::Builder::new().prefix(".demo").tempdir_in(&parent).with_context(|| format!("cannot write in {}", parent.display()))?;
+    replaceable(&args.output)?;
+    let partial = whole::beside(&args.output)?;
     let text = demonstrate(partial.path(), args.frames.into())?;
-    replace(&args.output, &parent, partial)?;
+    replace(&args.output, partial)?;
     print!("\n{text}");
     where_to_look(&args.output);
     Ok(())
@@ -202,29 +202,22 @@ fn marker(truth: &Truth) -> String {
     format!("{facts:#}\n")
 }
 
-/// The folder to work in, once it is clear that `output` may be written.
-fn replaceable(output: &Path) -> Result<PathBuf> {
+/// An error where `output` holds anything but an earlier demo.
+fn replaceable(output: &Path) -> Result<()> {
     ensure!(output.file_name().is_some(), "{}: name a folder of its own with -o", output.display());
     let occupied = output.exists() && output.read_dir().map(|mut entries| entries.next().is_some()).unwrap_or(true);
     let ours = std::fs::read_to_string(output.join(MARKER)).is_ok_and(|text| text.contains(PROGRAM));
     ensure!(!occupied || ours, "{}: exists already and is no demo's folder; remove it or choose another with -o", output.display());
-    let parent = output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")).to_path_buf();
-    std::fs::create_dir_all(&parent).with_context(|| format!("cannot create {}", parent.display()))?;
-    Ok(parent)
+    Ok(())
 }
 
 /// Puts the finished folder in the place of an earlier one.
-fn replace(output: &Path, parent: &Path, partial: tempfile::TempDir) -> Result<()> {
-    let moved = || format!("cannot rename {} to {}", partial.path().display(), output.display());
-    make_readable(partial.path())?;
-    let earlier = tempfile::Builder::new().prefix(".earlier").tempdir_in(parent)?;
+fn replace(output: &Path, partial: TempDir) -> Result<()> {
+    let earlier = whole::beside(output)?;
     if output.exists() {
-        std::fs::rename(output, earlier.path().join("demo")).with_context(moved)?;
+        std::fs::rename(output, earlier.path().join("demo")).with_context(|| format!("cannot replace {}", output.display()))?;
     }
-    std::fs::rename(partial.path(), output).with_context(moved)?;
-    // What it held is in place now.
-    let _ = partial.keep();
-    Ok(())
+    whole::publish(partial, output)
 }
 
 fn where_to_look(output: &Path) {
