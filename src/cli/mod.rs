@@ -4,6 +4,7 @@ mod clouds;
 mod demo;
 mod disparity;
 mod generate;
+mod interrupt;
 mod model;
 mod motions;
 mod observe;
@@ -59,6 +60,7 @@ pub fn silence_opencv() {
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
+    interrupt::catch();
     match cli.command {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),

@@ -7,7 +7,7 @@ use muybridge::footage::FrameSet;
 use muybridge::io::session::Session;
 use rayon::prelude::*;
 
-use super::progress;
+use super::{interrupt, progress};
 
 /// Frames that are in memory at once.
 const BATCH: usize = 8;
@@ -30,6 +30,7 @@ pub fn observe(
         let clouds: Vec<FrameCloud> = batch
             .par_iter()
             .map(|frame| {
+                interrupt::check()?;
                 let cloud = rig.frame(&frame.images, options).with_context(|| format!("frame {}", frame.number));
                 bar.inc(1);
                 cloud

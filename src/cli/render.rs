@@ -7,7 +7,7 @@ use clap::Args;
 use image::{ColorType, ImageEncoder, ImageFormat, codecs::png::PngEncoder};
 use rayon::prelude::*;
 
-use super::{progress, whole};
+use super::{interrupt, progress, whole};
 use muybridge::body::{Clip, Pose, Shape, place};
 use muybridge::io::{calib_toml, joints_csv, read_clip, write_atomic};
 use muybridge::phantom::{DepthMap, Scene, Stage, View, depth, mask, render, render_stage, staging};
@@ -152,6 +152,7 @@ fn write_pictures(folder: &Path, take: &Take) -> Result<()> {
     let pictures: Vec<_> = (0..take.poses.len()).flat_map(|frame| views.iter().map(move |view| (frame, view))).collect();
     let progress = progress::bar("render", pictures.len() as u64);
     pictures.par_iter().try_for_each(|(frame, view)| {
+        interrupt::check()?;
         write_frame(folder, take, view, *frame)?;
         progress.inc(1);
         anyhow::Ok(())

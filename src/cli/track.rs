@@ -18,7 +18,7 @@ use muybridge::style::Style;
 use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
 
 use super::motions::ActivityName;
-use super::observe;
+use super::{interrupt, observe};
 
 /// Frames in the strip of overlays.
 const STRIP: usize = 6;
@@ -136,9 +136,10 @@ pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOp
     let options = FitOptions { floor_m, ..*options };
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
-    let fit = fit::fit(&observations, &session.rig, &model.model, &options, &|_, share| {
+    let fit = fit::fit(&observations, &session.rig, &model.model, &options, &|share| {
         let percent = (100.0 * share) as u64;
         bar.inc(percent.saturating_sub(done.replace(percent)));
+        !interrupt::came()
     })
     .with_context(|| session.folder.display().to_string())?;
     bar.finish();

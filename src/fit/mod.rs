@@ -35,6 +35,8 @@ pub enum FitError {
     NobodySeen { frames: usize, with_person: usize, points: usize },
     #[error("the motion model holds no cycles; build it again with `muybridge model build`")]
     EmptyModel,
+    #[error("interrupted; nothing was written, run the same command to begin again")]
+    Interrupted,
 }
 
 /// What to use of model and data.
@@ -152,17 +154,18 @@ impl Run<'_> {
     }
 }
 
-/// Fits `model` to the observations of one session; `progress` is told what begins, and the share done.
+/// Fits `model` to the observations of one session; `progress` is told the share done and says whether to go on.
 pub fn fit(
     observations: &[Observation],
     rig: &Rig,
     model: &Model,
     options: &FitOptions,
-    progress: &dyn Fn(&str, f64),
+    progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
     if model.members.is_empty() {
         return Err(FitError::EmptyModel);
     }
+    let step = |share| if progress(share) { Ok(()) } else { Err(FitError::Interrupted) };
     let up = rig.up.direction();
     let viewpoint = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len().max(1) as f64;
     let track = start::track(observations, &viewpoint, &up, options.floor_m)?;
@@ -172,12 +175,12 @@ pub fn fit(
         observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
     };
     let sparse = chosen(200, 40);
-    progress("search for cadence and phase", 0.0);
+    step(0.0)?;
     let mean = Curve::new(model, 0);
     let search = Settings { model_m: 0.06, ..SETTINGS };
     let found = start::hypotheses(&track, &sparse, &mean, model, &search, &known);
     let mut run = Run { model, known, iterations: 0 };
-    progress("both half-cycles", 0.1);
+    step(0.1)?;
     let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
     let ten = Curve::new(model, 10);
     let mut candidates: Vec<(f64, State)> = pair(&found)
@@ -192,20 +195,20 @@ pub fn fit(
     let mut state = candidates.swap_remove(0).1;
 
     let dense = chosen(options.points, options.rays);
-    progress("all points", 0.4);
+    step(0.4)?;
     let free_phase = SETTINGS.phase_acceleration;
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, phase_acceleration: free_phase, refreshes: 5 });
-    progress("limb lengths", 0.55);
+    step(0.55)?;
     state = run.stage(state, &dense, &ten, &Stage { free: SHAPED, model_m: 0.02, phase_acceleration: free_phase, refreshes: 6 });
-    progress("more components", 0.7);
+    step(0.7)?;
     let curve = Curve::new(model, options.components);
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &dense, &curve, &Stage { free: SHAPED, model_m: 0.02, phase_acceleration: free_phase, refreshes: 10 });
-    progress("uncertainty", 0.95);
+    step(0.95)?;
     Ok(finish(run, state, curve, &dense, observations, hypotheses))
 }
 
-/// The best hypothesis and the best one about half a cycle from it; for a jump the two best.
+/// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.
 fn pair(found: &[start::Hypothesis]) -> Vec<&start::Hypothesis> {
     let Some(best) = found.first() else { return Vec::new() };
     let middle = |h: &start::Hypothesis| h.state.carriers[h.state.carriers.len() / 2].phase;

