@@ -10,6 +10,7 @@ pub mod problem;
 pub mod start;
 pub mod state;
 pub mod targets;
+pub mod weighing;
 
 use std::sync::Arc;
 
@@ -22,9 +23,10 @@ use crate::math::arrow::{LmOptions, minimise};
 use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
 use curve::Curve;
-use problem::{Fitness, Frame, Free, Known, Outside, Problem, Settings, fitness, total};
+use problem::{Frame, Free, Known, Outside, Problem, Settings};
 use state::State;
 pub use targets::Observation;
+use weighing::{Fitness, fitness, total};
 
 /// Why a fit cannot begin.
 #[derive(Debug, thiserror::Error)]

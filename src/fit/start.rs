@@ -11,14 +11,18 @@ use rayon::prelude::*;
 
 use super::FitError;
 use super::curve::Curve;
-use super::problem::{Frame, Known, Settings, fitness, total};
+use super::problem::{Frame, Known, Settings};
 use super::state::{Carrier, State};
 use super::targets::Observation;
+use super::weighing::{fitness, total};
 use crate::body::Shape;
+use crate::math::order::quantile;
 use crate::motion_model::Model;
 
 /// Clouds with fewer points say nothing about where the person is.
 const FEWEST_POINTS: usize = 60;
+/// A path of fewer frames has no speed.
+const FEWEST_FRAMES: usize = 5;
 /// From the front of the body to its middle.
 const HALF_DEPTH_M: f64 = 0.09;
 /// A floor farther than this from the lowest points is not the one that the person walks on.
@@ -56,24 +60,20 @@ pub struct Hypothesis {
 
 /// Track, heading and stature from the clouds.
 pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector3<f64>, floor_m: Option<f64>) -> Result<Track, FitError> {
-    let seen: Vec<(f64, Vector3<f64>)> =
-        observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS).map(|o| (o.time_s, median(o))).collect();
-    if seen.len() < 5 {
-        return Err(FitError::NobodySeen { frames: observations.len(), with_person: seen.len(), points: FEWEST_POINTS });
+    let seen: Vec<&Observation> = observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS).collect();
+    let nobody = || FitError::NobodySeen { frames: observations.len(), with_person: seen.len(), points: FEWEST_POINTS };
+    if seen.len() < FEWEST_FRAMES {
+        return Err(nobody());
     }
-    let (lowest, top) = extent(observations, up);
+    let (lowest, top) = extent(&seen, up).ok_or_else(nobody)?;
     let floor = floor_m.filter(|floor| (floor - lowest).abs() < STANDING_ON_M).unwrap_or(lowest);
     let stature = (top - floor).clamp(1.2, 2.1);
     let horizontal = |v: Vector3<f64>| v - up * v.dot(up);
-    let deeper: Vec<Vector3<f64>> =
-        seen.iter().map(|(_, x)| horizontal(*x) + horizontal(x - viewpoint).normalize() * HALF_DEPTH_M).collect();
-    let middle = seen.iter().map(|(t, _)| t).sum::<f64>() / seen.len() as f64;
-    let times: Vec<f64> = seen.iter().map(|(t, _)| t - middle).collect();
-    let coefficients = parabola(&times, &deeper).ok_or(FitError::NobodySeen {
-        frames: observations.len(),
-        with_person: seen.len(),
-        points: FEWEST_POINTS,
-    })?;
+    let deeper = |x: Vector3<f64>| horizontal(x) + horizontal(x - viewpoint).normalize() * HALF_DEPTH_M;
+    let places: Vec<Vector3<f64>> = seen.iter().filter_map(|o| median(o)).map(deeper).collect();
+    let middle = seen.iter().map(|o| o.time_s).sum::<f64>() / seen.len() as f64;
+    let times: Vec<f64> = seen.iter().map(|o| o.time_s - middle).collect();
+    let coefficients = parabola(&times, &places).ok_or_else(nobody)?;
     let hip = up * (floor + Shape::template(stature).hip_height_m());
     let at = |t: f64| coefficients[0] + coefficients[1] * t + coefficients[2] * t * t + hip;
     Ok(Track {
@@ -86,23 +86,17 @@ pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector
 }
 
 /// Heights of the lowest and highest point: quantiles of each cloud against stray points, then medians over the frames.
-fn extent(observations: &[Observation], up: &Vector3<f64>) -> (f64, f64) {
-    let quantiles = |q: f64| {
-        let clouds = observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS);
-        let values = clouds.map(|o| quantile(o.cloud.points.iter().map(|p| p.position.dot(up)).collect(), q));
-        quantile(values.collect(), 0.5)
+fn extent(seen: &[&Observation], up: &Vector3<f64>) -> Option<(f64, f64)> {
+    let middle = |q: f64| {
+        let of_cloud = |o: &&Observation| quantile(o.cloud.points.iter().map(|p| p.position.dot(up)).collect(), q);
+        quantile(seen.iter().filter_map(of_cloud).collect(), 0.5)
     };
-    (quantiles(0.003), quantiles(0.997))
+    Some((middle(0.003)?, middle(0.997)?))
 }
 
-/// The `q` quantile of at least one value.
-fn quantile(mut values: Vec<f64>, q: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[((values.len() - 1) as f64 * q) as usize]
-}
-
-fn median(observation: &Observation) -> Vector3<f64> {
-    Vector3::from_fn(|axis, _| quantile(observation.cloud.points.iter().map(|p| p.position[axis]).collect(), 0.5))
+fn median(observation: &Observation) -> Option<Vector3<f64>> {
+    let along = |axis: usize| quantile(observation.cloud.points.iter().map(|p| p.position[axis]).collect(), 0.5);
+    Some(Vector3::new(along(0)?, along(1)?, along(2)?))
 }
 
 /// Least-squares parabola through points over time, twice reweighted against outliers; `None` if singular.

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::write_atomic;
 use crate::body::Length;
-use crate::fit::{Fit, Observation, problem::total};
+use crate::fit::{Fit, Observation, weighing::total};
 
 /// Fewer inlying points than this leave a frame to its neighbours.
 const FEW_POINTS: usize = 40;

@@ -1,0 +1,198 @@
+//! What each measurement counts: Cauchy weights over variances along the normal, gates, and how well a state explains all.
+//!
+//! ω = base / ((nᵀ Σ n + σ²) (1 + (r/cσ)²)). Weights, κ and the points of rays are frozen for one solver run.
+//! Checked against a dense search (rays); the weights enter the Jacobian tests of `problem`.
+
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use super::curve::Curve;
+use super::problem::{Frame, Known, Outside, Settings, Target};
+use super::state::State;
+use crate::body::PosedSurface;
+use crate::body::surface::Evaluation;
+
+/// Frozen quantities of one target.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Frozen {
+    pub x: Vector3<f64>,
+    /// ω_i.
+    pub weight: f64,
+    /// κ_i.
+    pub metres_per_root: f64,
+}
+
+/// Frozen quantities of one primitive in one silhouette's picture.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct FrozenOutside {
+    pub weight: f64,
+    /// Depth over focal length.
+    pub metres_per_px: f64,
+}
+
+/// Scale of the Cauchy loss in standard deviations: 95 % efficiency for Gaussian noise.
+const CAUCHY: f64 = 2.385;
+/// The same for silhouettes: a limb far outside is a hole in the mask less often than a limb out of place.
+const OUTSIDE_CAUCHY: f64 = 6.0;
+/// Skin whose outward normal makes a larger cosine than this with the line of sight is not seen.
+const FACING: f64 = 0.2;
+/// Primitives that a ray passes nearest to, tried as the start of its closest approach.
+const CANDIDATES: usize = 6;
+/// Outlines lower than this above the floor are those of contact shadows.
+const CONTACT_M: f64 = 0.06;
+/// Added to the distance of a point that only the far side of the body explains.
+const BEHIND_M: f64 = 0.1;
+/// How well a state explains the targets, robustly.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Fitness {
+    /// Σ ω ½c² ln(1 + (r/cσ)²) over the targets, without priors.
+    pub cost: f64,
+    pub points: usize,
+    /// Sum of squared distances of points within 3 σ, m², and their number.
+    pub inlier_square: f64,
+    pub inliers: usize,
+    /// Effective number of measurements: sum of weights relative to a full-weight target.
+    pub effective: f64,
+}
+
+impl Fitness {
+    fn add(self, other: Fitness) -> Fitness {
+        Fitness {
+            cost: self.cost + other.cost,
+            points: self.points + other.points,
+            inlier_square: self.inlier_square + other.inlier_square,
+            inliers: self.inliers + other.inliers,
+            effective: self.effective + other.effective,
+        }
+    }
+}
+
+/// Frozen weights of one frame at a posed surface, and how well it fits.
+pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings, known: &Known) -> (Vec<Frozen>, Fitness) {
+    let mut evaluation = Evaluation::default();
+    let mut fitness = Fitness::default();
+    let frozen = frame.targets.iter().map(|target| {
+        let (x, base) = match target {
+            Target::Point { x, .. } => (*x, settings.point_weight),
+            Target::Ray { origin, direction, .. } => (closest_on_ray(surface, origin, direction, &mut evaluation), settings.ray_weight),
+        };
+        surface.evaluate_into(&x, &mut evaluation);
+        let normal = evaluation.gradient.normalize();
+        let (variance, hidden) = match target {
+            Target::Point { covariance, .. } => {
+                (normal.dot(&(covariance * normal)), normal.dot(&(x - known.viewpoint).normalize()) > FACING)
+            }
+            Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), near_floor(known, &x)),
+        };
+        let precision = 1.0 / (variance + settings.model_m * settings.model_m);
+        let behind = hidden && matches!(target, Target::Point { .. });
+        let distance = evaluation.distance().abs() + if behind { BEHIND_M } else { 0.0 };
+        let scaled = distance * distance * precision / (CAUCHY * CAUCHY);
+        let robust = if hidden { 0.0 } else { 1.0 / (1.0 + scaled) };
+        fitness.cost += base * 0.5 * CAUCHY * CAUCHY * scaled.ln_1p();
+        fitness.points += 1;
+        fitness.effective += base * robust;
+        if distance * distance * precision < 9.0 && matches!(target, Target::Point { .. }) {
+            fitness.inliers += 1;
+            fitness.inlier_square += distance * distance;
+        }
+        Frozen { x, weight: base * robust * precision, metres_per_root: evaluation.metres_per_root() }
+    });
+    (frozen.collect(), fitness)
+}
+
+pub(super) fn outside_px(outside: &Outside, x: &Vector3<f64>) -> f64 {
+    outside.camera.project(x).map_or(0.0, |pixel| outside.field.at(pixel.x, pixel.y).0)
+}
+
+/// Frozen quantities of the primitives in a frame's silhouettes, and their robust cost.
+pub(super) fn freeze_outsides(frame: &Frame, surface: &PosedSurface, settings: &Settings) -> (Vec<FrozenOutside>, f64) {
+    let mut cost = 0.0;
+    let precision = 1.0 / (settings.model_m * settings.model_m);
+    let frozen = frame.outsides.iter().flat_map(|o| surface.primitives.iter().map(move |p| (o, p))).map(|(outside, p)| {
+        let metres_per_px = outside.camera.camera_point(&p.centre).z / outside.camera.matrix[(0, 0)];
+        let scaled = (outside_px(outside, &p.centre) * metres_per_px).powi(2) * precision / (OUTSIDE_CAUCHY * OUTSIDE_CAUCHY);
+        cost += settings.outside_weight * 0.5 * OUTSIDE_CAUCHY * OUTSIDE_CAUCHY * scaled.ln_1p();
+        FrozenOutside { weight: settings.outside_weight * precision / (1.0 + scaled), metres_per_px }
+    });
+    (frozen.collect(), cost)
+}
+
+fn near_floor(known: &Known, x: &Vector3<f64>) -> bool {
+    known.floor_m.is_some_and(|floor| x.dot(&known.up) < floor + CONTACT_M)
+}
+
+/// Robust fitness of each frame at a state.
+pub fn fitness(curve: &Curve, frames: &[Frame], settings: &Settings, known: &Known, state: &State) -> Vec<Fitness> {
+    let of_frame = |t: usize| {
+        let surface = state.posed(curve, t).surface;
+        let points = freeze(&frames[t], &surface, settings, known).1;
+        Fitness { cost: points.cost + freeze_outsides(&frames[t], &surface, settings).1, ..points }
+    };
+    (0..frames.len()).into_par_iter().map(of_frame).collect()
+}
+
+/// Sum over frames, in their order.
+pub fn total(fitness: &[Fitness]) -> Fitness {
+    fitness.iter().fold(Fitness::default(), |sum, f| sum.add(*f))
+}
+
+/// The point of a ray nearest to the skin: least d_eff among the closest approaches to the primitives, then refined.
+fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
+    let mut approaches: Vec<(f64, f64)> = surface
+        .primitives
+        .iter()
+        .map(|p| {
+            let (o, d) = (p.unit_from_world * (origin - p.centre), p.unit_from_world * direction);
+            let along = -o.dot(&d) / d.norm_squared();
+            ((o + d * along).norm_squared(), along)
+        })
+        .collect();
+    approaches.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut best = (f64::INFINITY, 0.0);
+    for (_, along) in approaches.iter().take(CANDIDATES) {
+        surface.evaluate_into(&(origin + direction * *along), evaluation);
+        if evaluation.d_eff < best.0 {
+            best = (evaluation.d_eff, *along);
+        }
+    }
+    // Near one primitive d_eff is a parabola along the ray; three secant steps on its slope settle the blend.
+    let mut along = best.1;
+    for _ in 0..3 {
+        let h = 2e-3;
+        let mut slope = |s: f64| {
+            surface.evaluate_into(&(origin + direction * s), evaluation);
+            evaluation.gradient.dot(direction)
+        };
+        let (before, after) = (slope(along - h), slope(along + h));
+        let curvature = (after - before) / (2.0 * h);
+        if curvature <= 0.0 {
+            break;
+        }
+        along -= (0.5 * (before + after) / curvature).clamp(-0.03, 0.03);
+    }
+    origin + direction * along
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::curve::tests::made_up_model;
+    use crate::fit::problem::tests::{frames, state};
+
+    #[test]
+    fn ray_point_is_the_least_of_a_dense_search() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let surface = state.posed(&curve, 0).surface;
+        for target in &frames(&curve, &state)[0].targets {
+            if let Target::Ray { origin, direction, .. } = target {
+                let found = closest_on_ray(&surface, origin, direction, &mut Evaluation::default());
+                let dense =
+                    (0..8000).map(|i| surface.evaluate(&(origin + direction * (i as f64 * 1e-3))).d_eff).fold(f64::INFINITY, f64::min);
+                assert!(surface.evaluate(&found).d_eff < dense + 0.02, "{} {dense}", surface.evaluate(&found).d_eff);
+            }
+        }
+    }
+}
