@@ -60,6 +60,8 @@ pub fn silence_opencv() {
 /// Runs the command line.
 pub fn run(cli: Cli) -> Result<()> {
     rayon::ThreadPoolBuilder::new().num_threads(cli.threads.unwrap_or(0)).build_global()?;
+    // The cores are rayon's; OpenCV's own pool would only take turns with it.
+    opencv::core::set_num_threads(1)?;
     interrupt::catch();
     match cli.command {
         Command::Demo(args) => demo::run(&args),
