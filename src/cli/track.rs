@@ -216,7 +216,16 @@ pub fn draw(folder: &Path, rig: &Rig, tracked: &Tracked) -> Result<()> {
     Ok(())
 }
 
+/// Costs of the two half-cycle hypotheses closer than this leave open which leg is which.
+const UNDECIDED: f64 = 1.3;
+
 fn summary(folder: &Path, fit: &Fit) {
+    if fit.hypotheses[1] < UNDECIDED * fit.hypotheses[0] {
+        eprintln!(
+            "warning: with left and right legs exchanged the cost is {:.0} against {:.0}; look at the pictures (--pictures) before you trust the sides",
+            fit.hypotheses[1], fit.hypotheses[0]
+        );
+    }
     let shape = fit.shape();
     let observed = fit.weight_uncertainty().iter().filter(|u| **u < 0.5).count();
     println!(
