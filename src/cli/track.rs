@@ -133,10 +133,9 @@ pub fn look(session: &Session, mut each: impl FnMut(&CloudRig, &FrameSet, &Frame
 /// The fit to what was seen of a session.
 pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
     let Seen { observations, pictures, floor_m } = seen;
-    let options = FitOptions { floor_m, ..*options };
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
-    let fit = fit::fit(&observations, &session.rig, &model.model, &options, &|share| {
+    let fit = fit::fit(&observations, &session.rig, &model.model, floor_m, options, &|share| {
         let percent = (100.0 * share) as u64;
         bar.inc(percent.saturating_sub(done.replace(percent)));
         !interrupt::came()

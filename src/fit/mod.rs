@@ -16,9 +16,8 @@ use std::sync::Arc;
 
 use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
-use serde::Serialize;
 
-use crate::body::{Length, Pose, Shape};
+use crate::body::{Pose, Shape};
 use crate::math::arrow::{LmOptions, minimise};
 use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
@@ -42,7 +41,7 @@ pub enum FitError {
 }
 
 /// What to use of model and data.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug)]
 pub struct FitOptions {
     /// Components of the model in the last stage.
     pub components: usize,
@@ -50,15 +49,13 @@ pub struct FitOptions {
     pub points: usize,
     /// Silhouette rays per camera and frame.
     pub rays: usize,
-    /// Height of the floor along the rig's up axis, metres, where it is known.
-    pub floor_m: Option<f64>,
 }
 
 impl Default for FitOptions {
     /// Twenty components reach 2.5 degrees against the true joints where ten reach 4 (fit on CMU walks); 500 points and
     /// 100 rays a frame cost about the same as the silhouettes' search and more change nothing.
     fn default() -> Self {
-        FitOptions { components: 20, points: 500, rays: 100, floor_m: None }
+        FitOptions { components: 20, points: 500, rays: 100 }
     }
 }
 
@@ -156,11 +153,13 @@ impl Run<'_> {
     }
 }
 
-/// Fits `model` to the observations of one session; `progress` is told the share done and says whether to go on.
+/// Fits `model` to the observations of one session, with the floor at height `floor_m` along the rig's up axis where it is
+/// known; `progress` is told the share done and says whether to go on.
 pub fn fit(
     observations: &[Observation],
     rig: &Rig,
     model: &Model,
+    floor_m: Option<f64>,
     options: &FitOptions,
     progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
@@ -170,9 +169,9 @@ pub fn fit(
     let step = |share| if progress(share) { Ok(()) } else { Err(FitError::Interrupted) };
     let up = rig.up.direction();
     let viewpoint = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len().max(1) as f64;
-    let track = start::track(observations, &viewpoint, &up, options.floor_m)?;
+    let track = start::track(observations, &viewpoint, &up, floor_m)?;
     let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
-    let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: options.floor_m.filter(|floor| *floor == track.floor_m) };
+    let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
     let chosen = |points, rays| -> Vec<Frame> {
         observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
     };
@@ -262,11 +261,5 @@ impl Fit {
     pub fn rms_m(&self) -> f64 {
         let sum = total(&self.frames);
         (sum.inlier_square / sum.inliers.max(1) as f64).sqrt()
-    }
-
-    /// Standard deviation of a limb's length factor.
-    pub fn length_sigma(&self, limb: Length) -> f64 {
-        let i = self.state.layout().length(limb);
-        self.shared_covariance[(i, i)].sqrt()
     }
 }

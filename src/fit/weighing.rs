@@ -42,12 +42,12 @@ const CANDIDATES: usize = 6;
 const CONTACT_M: f64 = 0.06;
 /// Added to the distance of a point that only the far side of the body explains.
 const BEHIND_M: f64 = 0.1;
+
 /// How well a state explains the targets, robustly.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Fitness {
     /// Σ ω ½c² ln(1 + (r/cσ)²) over the targets, without priors.
     pub cost: f64,
-    pub points: usize,
     /// Sum of squared distances of points within 3 σ, m², and their number.
     pub inlier_square: f64,
     pub inliers: usize,
@@ -59,7 +59,6 @@ impl Fitness {
     fn add(self, other: Fitness) -> Fitness {
         Fitness {
             cost: self.cost + other.cost,
-            points: self.points + other.points,
             inlier_square: self.inlier_square + other.inlier_square,
             inliers: self.inliers + other.inliers,
             effective: self.effective + other.effective,
@@ -90,7 +89,6 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
         let scaled = distance * distance * precision / (CAUCHY * CAUCHY);
         let robust = if hidden { 0.0 } else { 1.0 / (1.0 + scaled) };
         fitness.cost += base * 0.5 * CAUCHY * CAUCHY * scaled.ln_1p();
-        fitness.points += 1;
         fitness.effective += base * robust;
         if distance * distance * precision < 9.0 && matches!(target, Target::Point { .. }) {
             fitness.inliers += 1;

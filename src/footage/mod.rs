@@ -1,11 +1,8 @@
 //! Simultaneous images with times, synchronization check, foreground.
 
 pub mod check;
-
 pub mod epipolar;
-
 pub mod foreground;
-
 pub mod regions;
 
 pub use foreground::{ForegroundOptions, foreground, spread, stage_from_frames};

@@ -2,23 +2,19 @@
 
 pub mod asf_amc;
 pub mod atomic;
-pub mod fit_json;
-pub mod joints_csv;
-pub mod pfm;
-pub mod ply;
-
-pub mod calib_toml;
-
-pub mod images;
-
-pub mod session;
-
 pub mod bvh;
+pub mod calib_toml;
+pub mod fit_json;
+pub mod images;
+pub mod joints_csv;
 pub mod manifest;
 pub mod mapping;
 pub mod mocap;
 pub mod model_npz;
 pub mod mot;
+pub mod pfm;
+pub mod ply;
+pub mod session;
 pub mod sidecar;
 pub mod style_json;
 pub mod video;
