@@ -168,7 +168,7 @@ impl Padded {
 
 /// 0 outside.
 #[inline(always)]
-fn pixel(image: &GrayImage, x: isize, y: isize) -> u8 {
+pub(super) fn pixel(image: &GrayImage, x: isize, y: isize) -> u8 {
     let inside = x >= 0 && y >= 0 && x < image.width() as isize && y < image.height() as isize;
     if inside { image.as_raw()[y as usize * image.width() as usize + x as usize] } else { 0 }
 }

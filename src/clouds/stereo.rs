@@ -72,7 +72,7 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let pairs: Vec<Pair> = others_of(views, reference).zip(&steps).map(pair).collect();
     let hypotheses = (range[0] as f64 * per_px) as usize..(range[1] as f64 * per_px).ceil() as usize + 1;
     let matches = correlate(&pairs, region, hypotheses, options.radius);
-    let confirmed = validate::confirmed(&matches, &steps, (f64::from(options.consistency_px) * per_px) as u16);
+    let confirmed = validate::confirmed(&matches, &pairs, (f64::from(options.consistency_px) * per_px) as u16);
     let (width, height) = here.plane.dimensions();
     let mut found = ViewDisparity {
         disparity: Plane::from_pixel(width, height, Luma([f32::NAN])),

@@ -3,15 +3,15 @@
 //! - uniqueness: no rival more than one hypothesis away costs less than (1 + u) times the winner;
 //! - consistency: every pixel of another view belongs to the cheapest of the winners that lead to it; a winner stands when the
 //!   view's owner of its place has the same disparity (left-right, top-bottom, without matching again). One confirming view
-//!   is enough, because near an outline the other view is often occluded;
+//!   is enough where the other does not contradict: an owner that is nearer hides the pixel, one that is farther would be
+//!   hidden by it;
 //! - surface: connected pieces of slowly changing disparity smaller than an area are dropped (cv::filterSpeckles).
 //!
 //! A bar for texture is left out: where there is none, rivals are as good as the winner, and a bar that adds anything to
 //! uniqueness takes bare skin first.
 
-use super::correlate::{Matches, NO_MATCH};
+use super::correlate::{Matches, NO_MATCH, Pair, pixel};
 use crate::rig::rectify::Plane;
-use nalgebra::Vector2;
 use rayon::prelude::*;
 
 /// Whether the winner of a pixel stands alone.
@@ -19,17 +19,29 @@ pub fn unique(cost: u8, rival: u8, ratio: f32) -> bool {
     f32::from(rival) > f32::from(cost) * (1.0 + ratio)
 }
 
-/// Bits of the views that confirm each pixel of the region, from each view's step in pixels per hypothesis.
-pub fn confirmed(matches: &Matches, steps: &[Vector2<f64>], tolerance: u16) -> Vec<u8> {
-    let by_view: Vec<Vec<bool>> = steps.par_iter().map(|step| confirmed_by(matches, *step, tolerance)).collect();
-    let bits = |i: usize| by_view.iter().enumerate().fold(0, |bits, (k, view)| bits | u8::from(view[i]) << k);
+/// What a view says of a pixel.
+#[derive(Clone, Copy, PartialEq)]
+enum Verdict {
+    Confirmed,
+    /// Something nearer stands there, or the place is out of view.
+    Hidden,
+    Contradicted,
+}
+
+/// Bits of the other views of `pairs` that confirm each pixel of the region, none where any contradicts.
+pub fn confirmed(matches: &Matches, pairs: &[Pair], tolerance: u16) -> Vec<u8> {
+    let by_view: Vec<Vec<Verdict>> = pairs.par_iter().map(|pair| verdicts(matches, pair, tolerance)).collect();
+    let bits = |i: usize| {
+        let bits = by_view.iter().enumerate().fold(0, |bits, (k, view)| bits | u8::from(view[i] == Verdict::Confirmed) << k);
+        if by_view.iter().any(|view| view[i] == Verdict::Contradicted) { 0 } else { bits }
+    };
     (0..matches.best.len()).map(bits).collect()
 }
 
-fn confirmed_by(matches: &Matches, step: Vector2<f64>, tolerance: u16) -> Vec<bool> {
-    let width = matches.region.width();
+fn verdicts(matches: &Matches, pair: &Pair, tolerance: u16) -> Vec<Verdict> {
+    let (region, width) = (matches.region, matches.region.width());
     let reach = matches.best.iter().filter(|b| **b != NO_MATCH).max().map_or(0, |b| usize::from(*b) + 1);
-    let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (step * h as f64).map(|v| v.round() as isize).into()).collect();
+    let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (pair.step * h as f64).map(|v| v.round() as isize).into()).collect();
     let lowest = |i: usize| shifts.iter().map(|s| s[i]).min().unwrap_or(0);
     let span = |i: usize| (shifts.iter().map(|s| s[i]).max().unwrap_or(0) - lowest(i)) as usize;
     let (wide, tall) = (width + span(0), matches.region.height() + span(1));
@@ -43,13 +55,21 @@ fn confirmed_by(matches: &Matches, step: Vector2<f64>, tolerance: u16) -> Vec<bo
             *owner = (*owner).min(u32::from(cost[1]) << 16 | u32::from(h));
         }
     }
-    let agrees = |(i, &h): (usize, &u16)| {
-        h != NO_MATCH && {
-            let owner = owners[i / width * wide + i % width + offsets[usize::from(h)]] as u16;
-            owner.abs_diff(h) <= tolerance
+    let verdict = |(i, &h): (usize, &u16)| {
+        if h == NO_MATCH {
+            return Verdict::Contradicted;
+        }
+        let owner = owners[i / width * wide + i % width + offsets[usize::from(h)]] as u16;
+        let [dx, dy] = shifts[usize::from(h)];
+        let [x, y] = [(region.x[0] + i % width) as isize + dx, (region.y[0] + i / width) as isize + dy];
+        match owner {
+            _ if pixel(&pair.other, x, y) == 0 => Verdict::Hidden,
+            owner if owner.abs_diff(h) <= tolerance => Verdict::Confirmed,
+            owner if owner > h => Verdict::Hidden,
+            _ => Verdict::Contradicted,
         }
     };
-    matches.best.iter().enumerate().map(agrees).collect()
+    matches.best.iter().enumerate().map(verdict).collect()
 }
 
 /// Removes connected pieces of fewer than `area_px` pixels; neighbours belong together when they differ by at most `step_px`.
@@ -124,6 +144,8 @@ fn join(parents: &mut [u32], a: usize, b: usize) {
 mod tests {
     use super::*;
     use crate::clouds::correlate::Region;
+    use image::{GrayImage, Luma};
+    use nalgebra::Vector2;
 
     #[test]
     fn speckle_filter_meets_opencv() {
@@ -143,17 +165,24 @@ mod tests {
 
     #[test]
     fn the_cheapest_winner_owns_a_place() {
-        // Pixels 10 and 12 lead to place 6 of a view on the right, pixel 14 alone to place 10.
+        // 10, 12 and 13 lead to place 6 of a view on the right, 14 alone to place 10, 3 leaves the picture.
         let region = Region { x: [0, 20], y: [0, 1] };
         let mut matches = Matches { region, best: vec![NO_MATCH; 20], cost: vec![[9; 3]; 20], rival: vec![255; 20] };
-        for (x, h, cost) in [(10, 4, 5), (12, 6, 7), (14, 4, 100)] {
+        for (x, h, cost) in [(10, 4, 7), (12, 6, 5), (13, 7, 9), (16, 10, 9), (14, 4, 100), (3, 4, 1)] {
             matches.best[x] = h;
             matches.cost[x][1] = cost;
         }
-        let mut expected = vec![0; 20];
-        expected[10] = 3;
-        expected[12] = 2;
-        expected[14] = 3;
-        assert_eq!(confirmed(&matches, &[Vector2::new(-1.0, 0.0), Vector2::new(0.0, 1.0)], 1), expected);
+        let pair = |x: f64, y: f64| Pair {
+            reference: GrayImage::from_pixel(20, 1, Luma([128])),
+            other: GrayImage::from_pixel(20, 30, Luma([128])),
+            step: Vector2::new(x, y),
+        };
+        let at = |bits: &[u8]| [10, 12, 13, 16, 14, 3].map(|i: usize| bits[i]);
+        // 10 is hidden by 12, 13 is near enough to it, 16 would hide it.
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0)], 1)), [0, 1, 1, 0, 1, 0]);
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)], 1)), [2, 3, 3, 2, 3, 2]);
+        // A third pixel with a farther winner contradicts.
+        (matches.best[8], matches.cost[8][1]) = (2, 1);
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)], 1)), [0, 0, 0, 0, 3, 2]);
     }
 }
