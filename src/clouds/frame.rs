@@ -56,6 +56,10 @@ pub struct FrameCloud {
     pub masks: Vec<Option<GrayImage>>,
     /// The person's disparities in the reference view, px; NaN elsewhere.
     pub disparity: Plane,
+    /// All validated disparities of the searched part of the reference view, px, the person's or not; NaN elsewhere.
+    pub matched: Plane,
+    /// Pixels of the reference view that changed against the stage, 0/255; all without a stage.
+    pub changed: GrayImage,
 }
 
 /// A rig made ready for footage: its rectified groups, and the empty stage as each of them sees it.
@@ -171,7 +175,10 @@ fn everything(
     let regions = vec![whole(rectification); planes.len()];
     let found = search(rectification, planes, &regions, range, options);
     let disparity = found[0].1.disparity.clone();
-    Ok(FrameCloud { cloud: points(rectification, &found[0], &disparity, options), masks: vec![None; cameras], disparity })
+    let cloud = points(rectification, &found[0], &disparity, options);
+    let [width, height] = rectification.size_px;
+    let changed = GrayImage::from_pixel(width, height, Luma([255]));
+    Ok(FrameCloud { cloud, masks: vec![None; cameras], matched: disparity.clone(), disparity, changed })
 }
 
 fn person(
@@ -193,7 +200,8 @@ fn person(
     for (k, view) in rectification.views.iter().enumerate() {
         masks[view.index] = Some(rectification.unwarp(k, &persons[k]));
     }
-    FrameCloud { cloud: points(rectification, &found[0], &disparity, options), masks, disparity }
+    let cloud = points(rectification, &found[0], &disparity, options);
+    FrameCloud { cloud, masks, disparity, matched: found[0].1.disparity.clone(), changed: changes[0].changed.clone() }
 }
 
 fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Vec<&'a GrayImage>, CloudError> {
@@ -239,7 +247,8 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
         masks[view.index] = Some(GrayImage::new(width, height));
     }
     let [width, height] = rectification.size_px;
-    FrameCloud { cloud: Cloud::default(), masks, disparity: Plane::from_pixel(width, height, Luma([f32::NAN])) }
+    let nothing = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    FrameCloud { cloud: Cloud::default(), masks, disparity: nothing.clone(), matched: nothing, changed: GrayImage::new(width, height) }
 }
 
 fn points(rectification: &Rectification, reference: &(StereoView, ViewDisparity), disparity: &Plane, options: &CloudOptions) -> Cloud {

@@ -1,0 +1,17 @@
+//! `muybridge bench`: tables of accuracy and time beside OpenCV's, in the same process.
+
+mod people;
+
+use anyhow::Result;
+
+#[derive(clap::Subcommand)]
+pub enum BenchCommand {
+    /// Clouds of people against the true depths and masks of rendered sessions, beside OpenCV's StereoSGBM
+    Clouds(people::PeopleArgs),
+}
+
+pub fn run(command: &BenchCommand) -> Result<()> {
+    match command {
+        BenchCommand::Clouds(args) => people::run(args),
+    }
+}
