@@ -30,7 +30,7 @@
 //! | kept, 2 / 4 / 5 / 8 paths                                   | 0.65 / 0.62 / 0.60 / 0.62 | 0.94 to 0.95 | 0.57 to 0.63 |
 //! | kept, costs in 1/8 or 1 grey level                          | 0.59 / 0.59 | 0.95 | 0.57 / 0.59 |
 
-use super::lanes::{LANES, Lanes};
+use super::lanes::{LANES, Lanes, blocks, blocks_mut};
 use image::GrayImage;
 use nalgebra::Vector2;
 use rayon::prelude::*;
@@ -161,8 +161,17 @@ struct Padded {
 
 impl Padded {
     fn reference(&self, image: &GrayImage) -> Vec<u8> {
-        let known = |x, y| Some(pixel(image, x, y)).filter(|v| *v != 0).unwrap_or(u8::MAX);
-        self.y.clone().flat_map(|y| self.x.clone().map(move |x| known(x, y))).collect()
+        let (width, height) = (image.width() as isize, image.height() as isize);
+        let mut values = vec![u8::MAX; self.x.len() * self.y.len()];
+        let (from, to) = (self.x.start.clamp(0, width), self.x.end.clamp(0, width));
+        for (y, out) in self.y.clone().zip(values.chunks_exact_mut(self.x.len())) {
+            if y >= 0 && y < height && from < to {
+                let row = &image.as_raw()[(y * width + from) as usize..(y * width + to) as usize];
+                let out = &mut out[(from - self.x.start) as usize..][..row.len()];
+                out.iter_mut().zip(row).for_each(|(out, &value)| *out = if value == 0 { u8::MAX } else { value });
+            }
+        }
+        values
     }
 }
 
@@ -229,30 +238,57 @@ struct Lines {
 
 impl Lines {
     fn of(&self, image: &GrayImage) -> Candidates {
-        let [(main_start, main), (other_start, other)] = [self.axes[self.main], self.axes[1 - self.main]];
+        let [(_, main), (_, other)] = [self.axes[self.main], self.axes[1 - self.main]];
         let far = main as isize - 1;
         let (lowest_place, lowest_line) = ((self.fold * far).min(0), (-self.shear * far).min(0));
         let length = (self.fold.abs() * far) as usize + self.depth;
         let count = other + (self.shear * far).unsigned_abs();
-        let value = |m: isize, line: isize| {
-            let (m, n) = (m + main_start, line + self.shear * m + other_start);
-            if self.main == 0 { pixel(image, m, n) } else { pixel(image, n, m) }
-        };
-        let fill = |(k, out): (usize, &mut [u8])| {
-            let line = k as isize + lowest_line;
-            for (k, out) in out.iter_mut().enumerate() {
-                let place = k as isize + lowest_place + self.first;
-                let (m, rest) = (place.div_euclid(self.fold), place.rem_euclid(self.fold));
-                let at = value(m, line);
-                *out = if rest == 0 { at } else { between(at, value(m + self.fold.signum(), line), rest, self.fold.abs()) };
-            }
-        };
         let mut data = vec![0u8; count * length];
-        data.par_chunks_exact_mut(length).enumerate().for_each(fill);
+        data.par_chunks_exact_mut(length).enumerate().for_each(|(k, out)| {
+            let line = k as isize + lowest_line;
+            let place = lowest_place + self.first;
+            if self.fold.abs() == 1 {
+                self.read(image, line, place * self.fold, self.fold, out);
+            } else {
+                let mut whole = vec![0; length / self.fold.unsigned_abs() + 3];
+                let start = place.div_euclid(self.fold);
+                self.read(image, line, start, self.fold.signum(), &mut whole);
+                for (k, out) in out.iter_mut().enumerate() {
+                    let place = place + k as isize;
+                    let (steps, rest) = ((place.div_euclid(self.fold) - start).unsigned_abs(), place.rem_euclid(self.fold));
+                    *out = if rest == 0 { whole[steps] } else { between(whole[steps], whole[steps + 1], rest, self.fold.abs()) };
+                }
+            }
+        });
         let length = length as isize;
         let per = [self.fold - self.shear * length, length];
         let origin = -lowest_line * length - lowest_place;
         Candidates::Lines { data, origin, per_x: per[self.main], per_y: per[1 - self.main] }
+    }
+
+    /// Pixels of a line from main coordinate `start` on, in steps of the fold's sign; what lies outside stays.
+    fn read(&self, image: &GrayImage, line: isize, start: isize, step: isize, out: &mut [u8]) {
+        let [(main_start, _), (other_start, _)] = [self.axes[self.main], self.axes[1 - self.main]];
+        let (width, height) = (image.width() as isize, image.height() as isize);
+        let at = |k: isize| {
+            let m = start + k * step;
+            let (m, n) = (m + main_start, line + self.shear * m + other_start);
+            if self.main == 0 { [m, n] } else { [n, m] }
+        };
+        let ([x, y], [next_x, next_y]) = (at(0), at(1));
+        let inside = |from: isize, per: isize, size: isize| match per {
+            0 if from >= 0 && from < size => 0..out.len() as isize,
+            0 => 0..0,
+            1 => -from..size - from,
+            _ => from + 1 - size..from + 1,
+        };
+        let (across, down) = (inside(x, next_x - x, width), inside(y, next_y - y, height));
+        let (from, to) = (across.start.max(down.start).max(0), across.end.min(down.end).min(out.len() as isize));
+        let (mut place, per) = (at(from)[1] * width + at(from)[0], (next_y - y) * width + next_x - x);
+        for out in out.get_mut(from as usize..to.max(from) as usize).into_iter().flatten() {
+            *out = image.as_raw()[place as usize];
+            place += per;
+        }
     }
 }
 
@@ -350,33 +386,28 @@ impl Windows {
     #[inline(always)]
     fn enter<L: Lanes>(&mut self, job: &Job, oldest: usize, y: usize) {
         let (width, depth) = (job.width, job.depth);
-        let (truncation, penalty) = (L::splat(TRUNCATION), L::splat(OCCLUSION_PENALTY));
         let [scratch, second_scratch] = &mut self.scratch;
         let Some(first) = job.pairs.first() else { return };
-        let (data, origin, per_x) = first.candidates.row(y, width, depth, scratch);
-        let values = first.reference_row(y, width);
-        let second = job.pairs.get(1).map(|p| (p.reference_row(y, width), p.candidates.row(y, width, depth, second_scratch)));
-        let pixels = self.ring[oldest].chunks_exact_mut(depth).zip(self.columns.chunks_exact_mut(depth));
-        for (x, (old, column)) in pixels.enumerate() {
-            let mut replace = |mut cost: L, h: usize| {
-                for _ in 0..job.halvings {
-                    cost = cost.halved();
+        let (values, row) = (first.reference_row(y, width), first.candidates.row(y, width, depth, scratch));
+        let pixels = self.ring[oldest].chunks_exact_mut(depth).zip(self.columns.chunks_exact_mut(depth)).enumerate();
+        match job.pairs.get(1) {
+            None => {
+                for ((x, (old, column)), &value) in pixels.zip(values) {
+                    let hypotheses = blocks(at(row, x, depth));
+                    for ((block, old), column) in hypotheses.iter().zip(blocks_mut(old)).zip(blocks_mut(column)) {
+                        replace(truncated::<L>(value, block), job.halvings, old, column);
+                    }
                 }
-                L::load(column, h).add(cost).sub(L::load(old, h)).store(column, h);
-                cost.store(old, h);
-            };
-            let value = L::splat(values[x]);
-            let hypotheses = &data[(origin + x as isize * per_x) as usize..][..depth];
-            let first = |h| value.abs_diff(L::load(hypotheses, h)).min(truncation);
-            match &second {
-                None => (0..depth).step_by(LANES).for_each(|h| replace(first(h), h)),
-                Some((values, (data, origin, per_x))) => {
-                    let value = L::splat(values[x]);
-                    let hypotheses = &data[(origin + x as isize * per_x) as usize..][..depth];
-                    for h in (0..depth).step_by(LANES) {
-                        let (a, b) = (first(h), value.abs_diff(L::load(hypotheses, h)).min(truncation));
+            }
+            Some(second) => {
+                let (second_values, second_row) = (second.reference_row(y, width), second.candidates.row(y, width, depth, second_scratch));
+                let penalty = L::splat(OCCLUSION_PENALTY);
+                for (((x, (old, column)), &value), &second_value) in pixels.zip(values).zip(second_values) {
+                    let hypotheses = blocks(at(row, x, depth)).iter().zip(blocks(at(second_row, x, depth)));
+                    for (((first, second), old), column) in hypotheses.zip(blocks_mut(old)).zip(blocks_mut(column)) {
+                        let (a, b) = (truncated::<L>(value, first), truncated::<L>(second_value, second));
                         let lower = a.min(b);
-                        replace(a.add(b).min(lower.add(lower).add(penalty)), h);
+                        replace(a.add(b).min(lower.add(lower).add(penalty)), job.halvings, old, column);
                     }
                 }
             }
@@ -385,20 +416,45 @@ impl Windows {
 
     #[inline(always)]
     fn means<L: Lanes>(&mut self, job: &Job) {
-        let reach = 2 * job.radius * job.depth;
-        let (columns, means) = (&self.columns[..], &mut self.means[..]);
-        for h in (0..job.depth).step_by(LANES) {
+        let (side, per_pixel) = (2 * job.radius + 1, job.depth / LANES);
+        let (columns, means) = (blocks(&self.columns), blocks_mut(&mut self.means));
+        for block in 0..per_pixel {
             let mut sum = L::wide_zero();
-            for at in (h..reach).step_by(job.depth) {
-                sum = L::wide_add(sum, L::load(columns, at));
+            for x in 0..side - 1 {
+                sum = L::wide_add(sum, L::load(&columns[x * per_pixel + block]));
             }
-            for at in (h..means.len()).step_by(job.depth) {
-                sum = L::wide_add(sum, L::load(columns, at + reach));
-                L::scaled(sum, job.scale).store(means, at);
-                sum = L::wide_sub(sum, L::load(columns, at));
+            let entering = &columns[(side - 1) * per_pixel..][..means.len()];
+            let mut at = block;
+            while at < means.len() {
+                sum = L::wide_add(sum, L::load(&entering[at]));
+                L::scaled(sum, job.scale).store(&mut means[at]);
+                sum = L::wide_sub(sum, L::load(&columns[at]));
+                at += per_pixel;
             }
         }
     }
+}
+
+/// The hypotheses of pixel x in a row of candidates.
+#[inline(always)]
+fn at((data, origin, per_x): (&[u8], isize, isize), x: usize, depth: usize) -> &[u8] {
+    &data[(origin + x as isize * per_x) as usize..][..depth]
+}
+
+/// Equation (1).
+#[inline(always)]
+fn truncated<L: Lanes>(value: u8, hypotheses: &[u8; LANES]) -> L {
+    L::splat(value).abs_diff(L::load(hypotheses)).min(L::splat(TRUNCATION))
+}
+
+/// A new cost takes the place of the oldest in its column.
+#[inline(always)]
+fn replace<L: Lanes>(mut cost: L, halvings: u32, old: &mut [u8; LANES], column: &mut [u8; LANES]) {
+    for _ in 0..halvings {
+        cost = cost.halved();
+    }
+    L::load(column).add(cost).sub(L::load(old)).store(column);
+    cost.store(old);
 }
 
 /// L of the three paths, and S.
@@ -426,17 +482,19 @@ impl Paths {
     fn advance<L: Lanes>(&mut self, costs: &[u8], depth: usize) {
         let width = self.down_least.len();
         let Self { down: [above, down], right: [before, right], left: [after, left], sums, down_least } = self;
-        sums.fill(0);
+        for (x, least) in down_least.iter_mut().enumerate() {
+            let (here, padded) = (x * depth, x * (depth + 2));
+            let (above, down) = (&above[padded..][..depth + 2], &mut down[padded..][..depth + 2]);
+            *least = step::<L, false>(&costs[here..][..depth], above, *least, down, &mut sums[here..][..depth]);
+        }
         before[1..=depth].fill(0);
         after[1..=depth].fill(0);
         let (mut right_least, mut left_least) = (0, 0);
+        // Two chains side by side keep the processor busy while each waits for itself.
         for x in 0..width {
-            let (here, there, padded) = (x * depth, (width - 1 - x) * depth, x * (depth + 2));
-            let (costs_here, costs_there) = (&costs[here..][..depth], &costs[there..][..depth]);
-            let sum = &mut sums[here..][..depth];
-            down_least[x] = step::<L>(costs_here, &above[padded..][..depth + 2], down_least[x], &mut down[padded..][..depth + 2], sum);
-            right_least = step::<L>(costs_here, before, right_least, right, sum);
-            left_least = step::<L>(costs_there, after, left_least, left, &mut sums[there..][..depth]);
+            let (here, there) = (x * depth, (width - 1 - x) * depth);
+            right_least = step::<L, true>(&costs[here..][..depth], before, right_least, right, &mut sums[here..][..depth]);
+            left_least = step::<L, true>(&costs[there..][..depth], after, left_least, left, &mut sums[there..][..depth]);
             std::mem::swap(before, right);
             std::mem::swap(after, left);
         }
@@ -444,18 +502,22 @@ impl Paths {
     }
 }
 
-/// One pixel of a path: L there from L and its least value at the pixel before, added to the sums. Returns the least.
+/// One pixel of a path: L there from L and its least value at the pixel before, written or added to the sums. Returns the
+/// least.
 #[inline(always)]
-fn step<L: Lanes>(costs: &[u8], before: &[u8], before_least: u8, here: &mut [u8], sums: &mut [u8]) -> u8 {
+fn step<L: Lanes, const ADD: bool>(costs: &[u8], before: &[u8], before_least: u8, here: &mut [u8], sums: &mut [u8]) -> u8 {
     let [small, large] = STEP_PENALTIES;
     let (small, jump, least) = (L::splat(small), L::splat(before_least + large), L::splat(before_least));
     let mut lowest = L::splat(255);
-    for h in (0..costs.len()).step_by(LANES) {
-        let beside = L::load(before, h).min(L::load(before, h + 2)).add_to_top(small);
-        let value = L::load(before, h + 1).min(beside).min(jump).sub(least).add(L::load(costs, h));
+    let count = costs.len();
+    let before = blocks(before).iter().zip(blocks(&before[1..=count])).zip(blocks(&before[2..]));
+    let inout = blocks(costs).iter().zip(blocks_mut(&mut here[1..=count])).zip(blocks_mut(sums));
+    for (((below, at), above), ((cost, here), sum)) in before.zip(inout) {
+        let beside = L::load(below).min(L::load(above)).add_to_top(small);
+        let value = L::load(at).min(beside).min(jump).sub(least).add(L::load(cost));
         lowest = lowest.min(value);
-        value.store(here, h + 1);
-        L::load(sums, h).add(value).store(sums, h);
+        value.store(here);
+        if ADD { L::load(sum).add(value) } else { value }.store(sum);
     }
     lowest.smallest()
 }
@@ -474,14 +536,28 @@ const MIDDLE: [u8; 2 * LANES + 3] = {
 fn winners<L: Lanes>(job: &Job, values: &[u8], sums: &[u8], found: &mut Matches, to: usize) {
     let (first, last) = (job.range.start, job.range.end - 1);
     for (x, sums) in sums.chunks_exact(job.depth).enumerate() {
-        let blocks = || (0..job.depth).step_by(LANES);
-        let lowest = blocks().fold(L::splat(255), |low, h| low.min(L::load(sums, h))).smallest();
-        let bits = |h: usize| Some((h, L::load(sums, h).equal(lowest))).filter(|(_, bits)| *bits != 0);
-        let best = blocks().find_map(bits).map_or(0, |(h, bits)| h + bits.trailing_zeros() as usize);
-        let far = |h: usize| L::load(sums, h).or(L::load(&MIDDLE, (h + LANES + 1).saturating_sub(best).min(LANES + 3)));
-        found.rival[to + x] = blocks().fold(L::splat(255), |low, h| low.min(far(h))).smallest();
-        let beside = |h: Option<usize>| h.and_then(|h| sums.get(h)).map_or(u8::MAX, |s| *s);
-        found.cost[to + x] = [beside(best.checked_sub(1)), lowest, beside(Some(best + 1))];
+        let mut low = L::splat(255);
+        for block in blocks(sums) {
+            low = low.min(L::load(block));
+        }
+        let lowest = low.smallest();
+        let mut best = 0;
+        for (k, block) in blocks(sums).iter().enumerate() {
+            let bits = L::load(block).equal(lowest);
+            if bits != 0 {
+                best = k * LANES + bits.trailing_zeros() as usize;
+                break;
+            }
+        }
+        let mut low = L::splat(255);
+        for (k, block) in blocks(sums).iter().enumerate() {
+            let shift = (k * LANES + LANES + 1).saturating_sub(best).min(LANES + 3);
+            let beside = blocks(&MIDDLE[shift..]).first().unwrap_or(block);
+            low = low.min(L::load(block).or(L::load(beside)));
+        }
+        found.rival[to + x] = low.smallest();
+        let below = if best > 0 { sums[best - 1] } else { u8::MAX };
+        found.cost[to + x] = [below, lowest, sums.get(best + 1).copied().unwrap_or(u8::MAX)];
         found.best[to + x] = if values[x] == u8::MAX || first + best > last { NO_MATCH } else { (first + best) as u16 };
     }
 }

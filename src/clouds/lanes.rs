@@ -6,12 +6,24 @@
 /// Number of bytes in a block.
 pub const LANES: usize = 32;
 
+/// The whole blocks of a row of bytes.
+#[inline(always)]
+pub fn blocks(row: &[u8]) -> &[[u8; LANES]] {
+    row.as_chunks().0
+}
+
+/// The whole blocks of a row of bytes.
+#[inline(always)]
+pub fn blocks_mut(row: &mut [u8]) -> &mut [[u8; LANES]] {
+    row.as_chunks_mut().0
+}
+
 /// A block of [`LANES`] unsigned bytes.
 pub trait Lanes: Copy {
     /// As many 16-bit numbers, in an order of its own.
     type Wide: Copy;
-    fn load(from: &[u8], at: usize) -> Self;
-    fn store(self, to: &mut [u8], at: usize);
+    fn load(from: &[u8; LANES]) -> Self;
+    fn store(self, to: &mut [u8; LANES]);
     fn splat(value: u8) -> Self;
     fn min(self, other: Self) -> Self;
     fn abs_diff(self, other: Self) -> Self;
@@ -46,12 +58,12 @@ fn each(f: impl Fn(usize) -> u8) -> [u8; LANES] {
 impl Lanes for [u8; LANES] {
     type Wide = [u16; LANES];
     #[inline(always)]
-    fn load(from: &[u8], at: usize) -> Self {
-        from[at..at + LANES].try_into().expect("a block")
+    fn load(from: &[u8; LANES]) -> Self {
+        *from
     }
     #[inline(always)]
-    fn store(self, to: &mut [u8], at: usize) {
-        to[at..at + LANES].copy_from_slice(&self);
+    fn store(self, to: &mut [u8; LANES]) {
+        *to = self;
     }
     #[inline(always)]
     fn splat(value: u8) -> Self {
@@ -130,15 +142,13 @@ pub mod avx2 {
     impl Lanes for Register {
         type Wide = [__m256i; 2];
         #[inline(always)]
-        fn load(from: &[u8], at: usize) -> Self {
-            let from = &from[at..at + LANES];
-            // SAFETY: the slice holds a whole block; unaligned loads are allowed.
+        fn load(from: &[u8; LANES]) -> Self {
+            // SAFETY: the array is a whole block; unaligned loads are allowed.
             Self(unsafe { _mm256_loadu_si256(from.as_ptr().cast()) })
         }
         #[inline(always)]
-        fn store(self, to: &mut [u8], at: usize) {
-            let to = &mut to[at..at + LANES];
-            // SAFETY: the slice holds a whole block; unaligned stores are allowed.
+        fn store(self, to: &mut [u8; LANES]) {
+            // SAFETY: the array is a whole block; unaligned stores are allowed.
             unsafe { _mm256_storeu_si256(to.as_mut_ptr().cast(), self.0) }
         }
         #[inline(always)]

@@ -22,24 +22,47 @@ pub fn gradient(plane: &Plane, along: Vector2<f64>) -> GrayImage {
     let mut values = vec![0u8; width * height];
     let row = |y: usize| &plane.as_raw()[y.min(height - 1) * width..][..width];
     values.par_chunks_exact_mut(width.max(1)).enumerate().for_each(|(y, out)| {
-        let (above, here, below) = (row(y.saturating_sub(1)), row(y), row(y + 1));
-        let mut smooth = vec![0.0; width + 2];
-        let mut slope = vec![0.0; width + 2];
-        for x in 0..width {
-            smooth[x + 1] = above[x] + 2.0 * here[x] + below[x];
-            slope[x + 1] = below[x] - above[x];
-        }
-        for line in [&mut smooth, &mut slope] {
-            (line[0], line[width + 1]) = (line[1], line[width]);
-        }
-        for x in 0..width {
-            let across = smooth[x + 2] - smooth[x];
-            let down = slope[x] + 2.0 * slope[x + 1] + slope[x + 2];
-            // NaN becomes 0.
-            out[x] = (128.5 + (along.x * across + along.y * down).clamp(-CAP, CAP)) as u8;
-        }
+        gradient_row([row(y.saturating_sub(1)), row(y), row(y + 1)], [along.x, along.y], out);
     });
     GrayImage::from_raw(plane.width(), plane.height(), values).expect("one value per pixel")
+}
+
+fn gradient_row(rows: [&[f32]; 3], along: [f32; 2], out: &mut [u8]) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { gradient_row_avx2(rows, along, out) };
+    }
+    gradient_row_plain(rows, along, out);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn gradient_row_avx2(rows: [&[f32]; 3], along: [f32; 2], out: &mut [u8]) {
+    gradient_row_plain(rows, along, out);
+}
+
+/// Equation (1) of the middle row.
+#[inline(always)]
+fn gradient_row_plain([above, here, below]: [&[f32]; 3], [right, down]: [f32; 2], out: &mut [u8]) {
+    let width = out.len();
+    let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
+    let mut smooth = vec![0.0; width + 2];
+    let mut slope = vec![0.0; width + 2];
+    for (x, (smooth, slope)) in smooth[1..=width].iter_mut().zip(&mut slope[1..=width]).enumerate() {
+        *smooth = above[x] + 2.0 * here[x] + below[x];
+        *slope = below[x] - above[x];
+    }
+    for line in [&mut smooth, &mut slope] {
+        (line[0], line[width + 1]) = (line[1], line[width]);
+    }
+    let (smooth, slope) = ((&smooth[..width], &smooth[2..]), (&slope[..width], &slope[1..=width], &slope[2..]));
+    for x in 0..width {
+        let across = smooth.1[x] - smooth.0[x];
+        let along = slope.0[x] + 2.0 * slope.1[x] + slope.2[x];
+        // NaN becomes 0.
+        out[x] = (128.5 + (right * across + down * along).clamp(-CAP, CAP)) as u8;
+    }
 }
 
 /// Gaussian blur with replicated borders.

@@ -30,46 +30,73 @@ enum Verdict {
 
 /// Bits of the other views of `pairs` that confirm each pixel of the region, none where any contradicts.
 pub fn confirmed(matches: &Matches, pairs: &[Pair], tolerance: u16) -> Vec<u8> {
-    let by_view: Vec<Vec<Verdict>> = pairs.par_iter().map(|pair| verdicts(matches, pair, tolerance)).collect();
-    let bits = |i: usize| {
-        let bits = by_view.iter().enumerate().fold(0, |bits, (k, view)| bits | u8::from(view[i] == Verdict::Confirmed) << k);
-        if by_view.iter().any(|view| view[i] == Verdict::Contradicted) { 0 } else { bits }
-    };
-    (0..matches.best.len()).map(bits).collect()
+    let region = matches.region;
+    let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(matches, pair)).collect();
+    let mut bits = vec![0u8; matches.best.len()];
+    bits.par_chunks_exact_mut(region.width().max(1)).enumerate().for_each(|(y, bits)| {
+        let best = &matches.best[y * region.width()..][..region.width()];
+        for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate().filter(|(_, (_, h))| **h != NO_MATCH) {
+            for (k, owners) in owners.iter().enumerate() {
+                match owners.verdict([x, y], h, tolerance) {
+                    Verdict::Confirmed => *bits |= 1 << k,
+                    Verdict::Hidden => {}
+                    Verdict::Contradicted => {
+                        *bits = 0;
+                        break;
+                    }
+                }
+            }
+        }
+    });
+    bits
 }
 
-fn verdicts(matches: &Matches, pair: &Pair, tolerance: u16) -> Vec<Verdict> {
-    let (region, width) = (matches.region, matches.region.width());
-    let reach = matches.best.iter().filter(|b| **b != NO_MATCH).max().map_or(0, |b| usize::from(*b) + 1);
-    let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (pair.step * h as f64).map(|v| v.round() as isize).into()).collect();
-    let lowest = |i: usize| shifts.iter().map(|s| s[i]).min().unwrap_or(0);
-    let span = |i: usize| (shifts.iter().map(|s| s[i]).max().unwrap_or(0) - lowest(i)) as usize;
-    let (wide, tall) = (width + span(0), matches.region.height() + span(1));
-    let offsets: Vec<usize> = shifts.iter().map(|s| (s[1] - lowest(1)) as usize * wide + (s[0] - lowest(0)) as usize).collect();
-    // Cost first, so that the least key is the cheapest winner, and of equal ones the farthest.
-    let mut owners = vec![u32::MAX; wide * tall];
-    let pixels = || matches.best.chunks_exact(width.max(1)).zip(matches.cost.chunks_exact(width.max(1))).enumerate();
-    for (y, (best, cost)) in pixels() {
-        for (x, (&h, cost)) in best.iter().zip(cost).enumerate().filter(|(_, (h, _))| **h != NO_MATCH) {
-            let owner = &mut owners[y * wide + x + offsets[usize::from(h)]];
-            *owner = (*owner).min(u32::from(cost[1]) << 16 | u32::from(h));
+/// For every place of another view, the cheapest winner that leads to it.
+struct Owners {
+    /// Cost above hypothesis, so that the least key is the cheapest winner, and of equal ones the farthest. Where nothing is
+    /// known the hypothesis is [`NO_MATCH`], nearer than all.
+    keys: Vec<u32>,
+    width: usize,
+    /// How far each hypothesis leads in `keys`.
+    shifts: Vec<u32>,
+}
+
+impl Owners {
+    fn new(matches: &Matches, pair: &Pair) -> Self {
+        let (width, height) = (matches.region.width(), matches.region.height());
+        let reach = matches.best.iter().filter(|b| **b != NO_MATCH).max().map_or(0, |b| usize::from(*b) + 1);
+        let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (pair.step * h as f64).map(|v| v.round() as isize).into()).collect();
+        let ends = |i: usize| shifts.iter().fold([0, 0], |[low, high], s| [s[i].min(low), s[i].max(high)]);
+        let ([left, right], [top, bottom]) = (ends(0), ends(1));
+        let wide = width + (right - left) as usize;
+        let mut keys = vec![u32::MAX; wide * (height + (bottom - top) as usize)];
+        let shifts: Vec<u32> = shifts.iter().map(|s| ((s[1] - top) as usize * wide + (s[0] - left) as usize) as u32).collect();
+        let rows = matches.best.chunks_exact(width.max(1)).zip(matches.cost.chunks_exact(width.max(1)));
+        for (y, (best, cost)) in rows.enumerate() {
+            for (x, (&h, cost)) in best.iter().zip(cost).enumerate().filter(|(_, (h, _))| **h != NO_MATCH) {
+                let key = &mut keys[y * wide + x + shifts[usize::from(h)] as usize];
+                *key = (*key).min(u32::from(cost[1]) << 16 | u32::from(h));
+            }
         }
+        let start = [matches.region.x[0] as isize + left, matches.region.y[0] as isize + top];
+        for (y, keys) in keys.chunks_exact_mut(wide.max(1)).enumerate() {
+            for (x, key) in keys.iter_mut().enumerate() {
+                if pixel(&pair.other, start[0] + x as isize, start[1] + y as isize) == 0 {
+                    *key = NO_MATCH.into();
+                }
+            }
+        }
+        Self { keys, width: wide, shifts }
     }
-    let verdict = |(i, &h): (usize, &u16)| {
-        if h == NO_MATCH {
-            return Verdict::Contradicted;
-        }
-        let owner = owners[i / width * wide + i % width + offsets[usize::from(h)]] as u16;
-        let [dx, dy] = shifts[usize::from(h)];
-        let [x, y] = [(region.x[0] + i % width) as isize + dx, (region.y[0] + i / width) as isize + dy];
-        match owner {
-            _ if pixel(&pair.other, x, y) == 0 => Verdict::Hidden,
+
+    #[inline]
+    fn verdict(&self, [x, y]: [usize; 2], h: u16, tolerance: u16) -> Verdict {
+        match self.keys[y * self.width + x + self.shifts[usize::from(h)] as usize] as u16 {
             owner if owner.abs_diff(h) <= tolerance => Verdict::Confirmed,
             owner if owner > h => Verdict::Hidden,
             _ => Verdict::Contradicted,
         }
-    };
-    matches.best.iter().enumerate().map(verdict).collect()
+    }
 }
 
 /// Removes connected pieces of fewer than `area_px` pixels; neighbours belong together when they differ by at most `step_px`.
