@@ -41,7 +41,7 @@ const TRUNCATION: u8 = 24;
 /// π of (2), grey levels.
 const OCCLUSION_PENALTY: u8 = 16;
 /// P1 and P2 of (4), half grey levels.
-const STEP_PENALTIES: [u8; 2] = [12, 32];
+pub(super) const STEP_PENALTIES: [u8; 2] = [12, 32];
 /// Rows of a band; more are slower to share out, fewer warm up more often.
 const BAND_ROWS: usize = 120;
 /// Rows until a path has forgotten where it began.
