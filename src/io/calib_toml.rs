@@ -7,11 +7,14 @@
 
 use super::write_atomic;
 use crate::math::rotation;
-use crate::rig::{Camera, Rig, RigError, Up};
+use crate::rig::{Camera, Lens, Rig, RigError, Up};
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
+
+const BROWN_CONRADY_TERMS: &str = "4, 5 or 8 numbers, k1, k2, p1, p2 (and k3 (and k4, k5, k6)); thin prism and tilt terms must be zero";
+const FISHEYE_TERMS: &str = "4 numbers, k1, k2, k3, k4, for a fisheye camera";
 
 /// What can be wrong with a rig file; every message names it.
 #[derive(Debug, thiserror::Error)]
@@ -28,8 +31,6 @@ pub enum CalibError {
     MissingKey { path: PathBuf, table: String, key: &'static str, expected: &'static str },
     #[error("{}: [{table}] `{key}` must be {expected}", path.display())]
     WrongValue { path: PathBuf, table: String, key: &'static str, expected: &'static str },
-    #[error("{}: [{table}] is a fisheye camera, which is not supported; calibrate it with the pinhole model (fisheye = false)", path.display())]
-    Fisheye { path: PathBuf, table: String },
     #[error("{}: {error}", path.display())]
     Rig { path: PathBuf, error: RigError },
 }
@@ -69,8 +70,14 @@ fn rig_text(rig: &Rig) -> String {
         let rotation = rotation::log(&UnitQuaternion::from_rotation_matrix(&c.camera_from_world));
         // Writing into a String cannot fail.
         let _ = writeln!(text, "[{}]\nname = {name}\nsize = [ {}, {} ]", key_text(&c.name), c.size_px[0], c.size_px[1]);
-        let _ = writeln!(text, "matrix = [ {} ]\ndistortions = {}", rows.join(", "), list(c.distortion.iter()));
-        let _ = writeln!(text, "rotation = {}\ntranslation = {}\nfisheye = false\n", list(rotation.iter()), list(c.translation.iter()));
+        let _ = writeln!(text, "matrix = [ {} ]\ndistortions = {}", rows.join(", "), list(c.lens.terms().iter()));
+        let _ = writeln!(
+            text,
+            "rotation = {}\ntranslation = {}\nfisheye = {}\n",
+            list(rotation.iter()),
+            list(c.translation.iter()),
+            c.lens.is_fisheye()
+        );
     }
     let up = if rig.up == Up::Y { "y" } else { "z" };
     text + &format!("[metadata]\nup = \"{up}\"\n")
@@ -116,9 +123,7 @@ struct CameraTable<'a> {
 
 impl CameraTable<'_> {
     fn camera(&self) -> Result<Camera, CalibError> {
-        if self.table.get("fisheye").is_some_and(|v| v.as_bool() != Some(false)) {
-            return Err(CalibError::Fisheye { path: self.path.into(), table: self.name.into() });
-        }
+        let fisheye = self.fisheye()?;
         let size = "two whole numbers, the width and height of the pictures in px";
         let size_px = self.read("size", size, |v| {
             let numbers = floats(v).filter(|n| n.len() == 2 && n.iter().all(|x| x.fract() == 0.0 && (1.0..1e6).contains(x)))?;
@@ -128,16 +133,22 @@ impl CameraTable<'_> {
             let rows: Vec<_> = v.as_array()?.iter().map(floats).collect::<Option<_>>()?;
             (rows.len() == 3 && rows.iter().all(|r| r.len() == 3)).then(|| Matrix3::from_row_iterator(rows.into_iter().flatten()))
         })?;
-        let distortion = self.read("distortions", "4 or 5 numbers, k1, k2, p1, p2 (and k3)", |v| {
-            let mut terms = floats(v).filter(|n| n.len() == 4 || n.len() == 5)?;
-            terms.resize(5, 0.0);
-            terms.try_into().ok()
+        let expected = if fisheye { FISHEYE_TERMS } else { BROWN_CONRADY_TERMS };
+        let lens = self.read("distortions", expected, |v| {
+            let terms = floats(v)?;
+            if fisheye { Lens::fisheye(&terms) } else { Lens::brown_conrady(&terms) }
         })?;
         let three = |v: &Value| floats(v).filter(|n| n.len() == 3).map(Vector3::from_vec);
         let rotation = self.read("rotation", "three numbers, a Rodrigues vector in radians", three)?;
         let translation = self.read("translation", "three numbers in metres", three)?;
         let camera_from_world = rotation::exp(&rotation).to_rotation_matrix();
-        Ok(Camera { name: self.name.into(), size_px, matrix, distortion, camera_from_world, translation })
+        Ok(Camera { name: self.name.into(), size_px, matrix, lens, camera_from_world, translation })
+    }
+
+    fn fisheye(&self) -> Result<bool, CalibError> {
+        let (path, table) = (self.path.to_path_buf(), self.name.to_string());
+        let wrong = CalibError::WrongValue { path, table, key: "fisheye", expected: "true or false" };
+        self.table.get("fisheye").map_or(Ok(false), |v| v.as_bool().ok_or(wrong))
     }
 
     fn read<T>(&self, key: &'static str, expected: &'static str, parse: impl Fn(&Value) -> Option<T>) -> Result<T, CalibError> {
@@ -196,8 +207,8 @@ up = "y"
         let rig = read_text(TWO_CAMERAS).unwrap();
         let names: Vec<_> = rig.cameras.iter().map(|c| c.name.as_str()).collect();
         assert_eq!(names, ["cam_2", "cam_10"]);
-        assert_eq!(rig.cameras[0].distortion, [-0.08, 0.01, 0.001, 0.0, 0.2]);
-        assert_eq!(rig.cameras[1].distortion, [-0.08, 0.01, 0.001, 0.0, 0.0]);
+        assert_eq!(rig.cameras[0].lens.terms(), [-0.08, 0.01, 0.001, 0.0, 0.2]);
+        assert_eq!(rig.cameras[1].lens.terms(), [-0.08, 0.01, 0.001, 0.0, 0.0]);
         assert_eq!((rig.cameras[0].size_px, rig.up), ([640, 480], Up::Y));
         assert_eq!(rig.cameras[1].matrix, Matrix3::new(550.0, 0.0, 320.0, 0.0, 551.0, 240.0, 0.0, 0.0, 1.0));
         assert!((rig.baselines_m()[0].2 - 0.3).abs() < 1e-12);
@@ -210,7 +221,7 @@ up = "y"
         // Half a turn is where rotation vectors are hardest.
         rig.cameras[0].camera_from_world =
             rotation::exp(&(Vector3::new(0.6, -0.48, 0.64) * (std::f64::consts::PI - 1e-6))).to_rotation_matrix();
-        rig.cameras[1].distortion[4] = 1.0 / 3.0e9;
+        rig.cameras[1].lens = Lens::Fisheye([0.1, -1.0 / 3.0e9, 0.0, 2.0]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("out/Calib.toml");
         write_rig(&path, &rig).unwrap();
@@ -230,8 +241,9 @@ up = "y"
             ("size = [ 640, 480 ]", "", "[cam_2] has no `size`"),
             ("size = [ 640, 480 ]", "size = [ 640.5, 480 ]", "[cam_2] `size` must be two whole numbers"),
             ("rotation = [ 1.6, 0.0, 0.0 ]", "rotation = [ 1.6, 0.0 ]", "[cam_2] `rotation` must be three numbers"),
-            ("0.001, 0.0, 0.2 ]", "0.001 ]", "[cam_2] `distortions` must be 4 or 5 numbers"),
-            ("fisheye = false", "fisheye = true", "[cam_2] is a fisheye camera"),
+            ("0.001, 0.0, 0.2 ]", "0.001 ]", "[cam_2] `distortions` must be 4, 5 or 8 numbers"),
+            ("fisheye = false", "fisheye = true", "[cam_2] `distortions` must be 4 numbers"),
+            ("fisheye = false", "fisheye = 1", "[cam_2] `fisheye` must be true or false"),
             ("[ 0.0, 551.0, 240.0 ], ", "", "`matrix` must be three rows"),
             ("up = \"y\"", "up = \"x\"", "[metadata] `up` must be \"y\" or \"z\""),
             ("name = \"left\"", "name = left", "is not TOML: line 10: "),

@@ -1,9 +1,11 @@
 //! Cameras and rigs of N cameras, three-view rectification.
 
 pub mod camera;
+pub mod lens;
 pub mod rectify;
 
 pub use camera::Camera;
+pub use lens::Lens;
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -128,7 +130,7 @@ fn validate_camera(c: &Camera) -> Result<(), RigError> {
     let camera = c.name.clone();
     let finite: [(&'static str, &[f64]); 4] = [
         ("the camera matrix", c.matrix.as_slice()),
-        ("the distortion", &c.distortion),
+        ("the distortion", c.lens.terms()),
         ("the rotation", c.camera_from_world.matrix().as_slice()),
         ("the translation", c.translation.as_slice()),
     ];
@@ -176,7 +178,7 @@ mod tests {
                 name: name.into(),
                 size_px: [640, 480],
                 matrix: Matrix3::new(550.0, 0.0, 320.0, 0.0, 550.0, 240.0, 0.0, 0.0, 1.0),
-                distortion: [0.0; 5],
+                lens: Lens::IDEAL,
                 camera_from_world,
                 translation: -(camera_from_world * Vector3::new(x, 0.0, z)),
             }
@@ -219,7 +221,10 @@ mod tests {
     #[test]
     fn impossible_cameras_are_refused() {
         assert!(matches!(changed(|c| c.translation = Vector3::new(0.0, 1.0, 0.0)), Err(RigError::SamePlace { .. })));
-        assert!(matches!(changed(|c| c.distortion[2] = f64::NAN), Err(RigError::NotFinite { what: "the distortion", .. })));
+        assert!(matches!(
+            changed(|c| c.lens = Lens::Fisheye([0.0, f64::NAN, 0.0, 0.0])),
+            Err(RigError::NotFinite { what: "the distortion", .. })
+        ));
         assert!(matches!(changed(|c| c.size_px = [0, 480]), Err(RigError::Size { .. })));
         assert!(matches!(changed(|c| c.matrix[(0, 0)] = 3.6), Err(RigError::Focal { .. })));
         assert!(matches!(changed(|c| c.size_px = [320, 240]), Err(RigError::PrincipalPoint { .. })));
