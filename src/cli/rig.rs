@@ -1,5 +1,6 @@
 //! `muybridge rig`: rig files in words and a picture, and from one form to another.
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, ensure};
@@ -120,13 +121,22 @@ fn convert(args: &ConvertArgs) -> Result<()> {
 fn show(args: &ShowArgs) -> Result<()> {
     let read = read(&args.file)?;
     let file = args.file.files.first().map_or(Path::new(""), PathBuf::as_path);
-    println!("{} ({}): {} cameras, {} up", file.display(), read.form, read.rig.cameras.len(), up_name(read.rig.up));
-    print!("{}", in_words(&read.rig));
+    let count = read.rig.cameras.len();
+    let head = format!("{} ({}): {count} cameras, {} up\n", file.display(), read.form, up_name(read.rig.up));
+    tell(&(head + &in_words(&read.rig)))?;
     if let Some(path) = &args.output {
         report::save(path, &report::rig_views(&read.rig)?).with_context(|| format!("cannot draw {}", path.display()))?;
-        println!("\npicture: {}", path.display());
+        tell(&format!("\npicture: {}\n", path.display()))?;
     }
     Ok(())
+}
+
+/// To stdout; a reader that has seen enough, such as `head`, is no failure.
+fn tell(text: &str) -> Result<()> {
+    match std::io::stdout().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error).context("cannot write to stdout"),
+        _ => Ok(()),
+    }
 }
 
 fn up_name(up: Up) -> &'static str {
