@@ -356,7 +356,7 @@ mod tests {
         let read = read_rig_files(std::slice::from_ref(&path), &RigReading::default()).unwrap();
         assert_eq!((read.rig.up, read.notices.len(), read.rig.cameras.len()), (Up::Y, 0, 3));
         for (camera, expected) in read.rig.cameras.iter().zip(&rig.cameras) {
-            assert!(camera.camera_from_world.angle_to(&expected.camera_from_world) < 1e-14);
+            assert!((camera.camera_from_world.matrix() - expected.camera_from_world.matrix()).norm() < 1e-14);
             assert_eq!(&Camera { camera_from_world: expected.camera_from_world, ..camera.clone() }, expected);
         }
         // From the file, as any OpenCV program does.

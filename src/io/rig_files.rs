@@ -128,7 +128,7 @@ fn level_notice(rig: &Rig, height_m: Option<f64>) -> String {
 }
 
 fn world_is_first_cameras(rig: &Rig) -> bool {
-    rig.cameras.first().is_some_and(|c| c.camera_from_world.angle() < 1e-9 && c.translation.norm() < 1e-9)
+    rig.cameras.first().is_some_and(|c| (c.camera_from_world.matrix() - Matrix3::identity()).norm() < 1e-9 && c.translation.norm() < 1e-9)
 }
 
 /// The files behind the given paths, their folders and the missing halves of pairs looked up.
