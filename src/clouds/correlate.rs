@@ -30,7 +30,7 @@
 //! | kept, 2 / 4 / 5 / 8 paths                                   | 0.65 / 0.62 / 0.60 / 0.62 | 0.94 to 0.95 | 0.57 to 0.63 |
 //! | kept, costs in 1/8 or 1 grey level                          | 0.59 / 0.59 | 0.95 | 0.57 / 0.59 |
 
-use super::lanes::{LANES, Lanes, blocks, blocks_mut};
+use super::lanes::{LANES, Lanes};
 use image::GrayImage;
 use nalgebra::Vector2;
 use rayon::prelude::*;
@@ -93,16 +93,21 @@ pub struct Matches {
 /// [`LARGEST_RADIUS`]). One or two pairs of one picture size.
 pub fn correlate(pairs: &[Pair], region: Region, range: Range<usize>, radius: usize) -> Matches {
     let job = Job::new(pairs, region, range, radius.clamp(1, LARGEST_RADIUS));
-    let count = region.height().div_ceil(BAND_ROWS).max(1);
-    let row = |band: usize| region.height() * band / count;
-    let bands: Vec<Matches> = (0..count).into_par_iter().map(|band| best_band(&job, row(band)..row(band + 1))).collect();
-    let mut all = Matches { region, best: Vec::new(), cost: Vec::new(), rival: Vec::new() };
-    for band in bands {
-        all.best.extend(band.best);
-        all.cost.extend(band.cost);
-        all.rival.extend(band.rival);
-    }
-    all
+    let count = region.width() * region.height();
+    let mut found = Matches { region, best: vec![NO_MATCH; count], cost: vec![[0; 3]; count], rival: vec![0; count] };
+    let bands = region.height().div_ceil(BAND_ROWS).max(1);
+    let rows = region.height().div_ceil(bands).max(1);
+    let chunk = (rows * region.width()).max(1);
+    let best = found.best.par_chunks_mut(chunk).zip(found.cost.par_chunks_mut(chunk)).zip(found.rival.par_chunks_mut(chunk));
+    best.enumerate().for_each(|(band, ((best, cost), rival))| match_band(&job, band * rows, Band { best, cost, rival }));
+    found
+}
+
+/// Where the winners of some rows go.
+struct Band<'a> {
+    best: &'a mut [u16],
+    cost: &'a mut [[u8; 3]],
+    rival: &'a mut [u8],
 }
 
 /// Everything that the bands share. Coordinates of the padded region start r pixels outside of it.
@@ -136,7 +141,8 @@ impl PairRows {
 
 impl Job {
     fn new(pairs: &[Pair], region: Region, range: Range<usize>, radius: usize) -> Self {
-        let depth = range.len().div_ceil(LANES).max(1) * LANES;
+        let blocks = range.len().div_ceil(LANES);
+        let depth = DEPTHS.into_iter().find(|d| *d >= blocks).unwrap_or(MOST_BLOCKS) * LANES;
         let padded = Padded {
             x: region.x[0] as isize - radius as isize..(region.x[1] + radius) as isize,
             y: region.y[0] as isize - radius as isize..(region.y[1] + radius) as isize,
@@ -177,7 +183,7 @@ impl Padded {
 
 /// 0 outside.
 #[inline(always)]
-pub(super) fn pixel(image: &GrayImage, x: isize, y: isize) -> u8 {
+fn pixel(image: &GrayImage, x: isize, y: isize) -> u8 {
     let inside = x >= 0 && y >= 0 && x < image.width() as isize && y < image.height() as isize;
     if inside { image.as_raw()[y as usize * image.width() as usize + x as usize] } else { 0 }
 }
@@ -325,201 +331,226 @@ impl Sample {
     }
 }
 
-fn best_band(job: &Job, rows: Range<usize>) -> Matches {
+/// Finds the winners of the rows of `band`, the first of which is `start`.
+fn match_band(job: &Job, start: usize, band: Band) {
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has AVX2.
-        return unsafe { best_band_avx2(job, rows) };
+        return unsafe { match_band_avx2(job, start, band) };
     }
-    best_band_with::<[u8; LANES]>(job, rows)
+    match_band_with::<[u8; LANES]>(job, start, band);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn best_band_avx2(job: &Job, rows: Range<usize>) -> Matches {
-    best_band_with::<super::lanes::avx2::Register>(job, rows)
+fn match_band_avx2(job: &Job, start: usize, band: Band) {
+    match_band_with::<super::lanes::avx2::Register>(job, start, band);
 }
 
-/// The winners of some rows of the region.
+/// Blocks of hypotheses that kernels are made for; the number in need is rounded up to one of them.
+const DEPTHS: [usize; 9] = [1, 2, 3, 4, 6, 8, 12, 16, MOST_BLOCKS];
+const MOST_BLOCKS: usize = 32;
+/// Hypotheses beyond this many are not searched.
+pub const MOST_HYPOTHESES: usize = MOST_BLOCKS * LANES;
+
 #[inline(always)]
-fn best_band_with<L: Lanes>(job: &Job, rows: Range<usize>) -> Matches {
+fn match_band_with<L: Lanes>(job: &Job, start: usize, band: Band) {
+    match job.depth / LANES {
+        1 => match_rows::<L, 1>(job, start, band),
+        2 => match_rows::<L, 2>(job, start, band),
+        3 => match_rows::<L, 3>(job, start, band),
+        4 => match_rows::<L, 4>(job, start, band),
+        6 => match_rows::<L, 6>(job, start, band),
+        8 => match_rows::<L, 8>(job, start, band),
+        12 => match_rows::<L, 12>(job, start, band),
+        16 => match_rows::<L, 16>(job, start, band),
+        _ => match_rows::<L, MOST_BLOCKS>(job, start, band),
+    }
+}
+
+#[inline(always)]
+fn match_rows<L: Lanes, const N: usize>(job: &Job, start: usize, band: Band) {
     let (side, width) = (2 * job.radius + 1, job.region.width());
-    let count = rows.len() * width;
-    let mut found = Matches { region: job.region, best: vec![0; count], cost: vec![[0; 3]; count], rival: vec![0; count] };
-    let mut windows = Windows::new(job);
-    let mut paths = Paths::new(width, job.depth);
-    let start = rows.start.saturating_sub(WARM_UP_ROWS);
-    for (n, y) in (start..rows.end + side - 1).enumerate() {
-        windows.enter::<L>(job, n % side, y);
+    let end = start + band.best.len() / width.max(1);
+    let mut rows = Rows::<N>::new(job);
+    let first = start.saturating_sub(WARM_UP_ROWS);
+    for (n, y) in (first..end + side - 1).enumerate() {
         if n + 1 < side {
+            rows.enter::<L>(job, n % side, y);
             continue;
         }
-        windows.means::<L>(job);
-        paths.advance::<L>(&windows.means, job.depth);
-        if let Some(row) = (y + 1).checked_sub(side + rows.start) {
+        rows.forwards::<L>(job, n % side, y);
+        if let Some(row) = (y + 1).checked_sub(side + start) {
             let values = &job.pairs[0].reference_row(y - job.radius, job.width)[job.radius..][..width];
-            winners::<L>(job, values, &paths.sums, &mut found, row * width);
+            let row = row * width..(row + 1) * width;
+            let out = Band { best: &mut band.best[row.clone()], cost: &mut band.cost[row.clone()], rival: &mut band.rival[row] };
+            rows.backwards::<L>(job, values, out);
         }
     }
-    found
 }
 
-/// Running sums of (3).
-struct Windows {
-    /// (2) of the rows in the windows, `[row][x][h]`.
-    ring: Vec<Vec<u8>>,
+/// All hypotheses of a pixel.
+type Pixel<const N: usize> = [[u8; LANES]; N];
+
+/// What is kept from row to row. Two sweeps make a row: forwards the costs, their means, the downward path and the path to the
+/// right; backwards the path to the left and the winners. So each sweep waits for one path only, and works meanwhile.
+struct Rows<const N: usize> {
+    /// (2) of the rows in the windows.
+    ring: Vec<Vec<Pixel<N>>>,
     /// Their sums over the rows.
-    columns: Vec<u8>,
-    /// (3) of the middle row in half grey levels.
-    means: Vec<u8>,
+    columns: Vec<Pixel<N>>,
+    /// (3) in half grey levels.
+    means: Vec<Pixel<N>>,
+    /// L of the downward path, and its least values.
+    down: Vec<Pixel<N>>,
+    down_least: Vec<u8>,
+    /// L of the downward and the right path together.
+    sums: Vec<Pixel<N>>,
     scratch: [Vec<u8>; 2],
 }
 
-impl Windows {
+impl<const N: usize> Rows<N> {
     fn new(job: &Job) -> Self {
-        let row = vec![0; job.width * job.depth];
-        let means = vec![0; job.region.width() * job.depth];
-        Self { ring: vec![row.clone(); 2 * job.radius + 1], columns: row, means, scratch: Default::default() }
+        let (padded, row) = (vec![[[0; LANES]; N]; job.width], vec![[[0; LANES]; N]; job.region.width()]);
+        let down_least = vec![0; row.len()];
+        let ring = vec![padded.clone(); 2 * job.radius + 1];
+        Self { ring, columns: padded, means: row.clone(), down: row.clone(), down_least, sums: row, scratch: Default::default() }
     }
 
-    /// Padded row `y` takes the place of the oldest.
+    /// Padded row `y` takes the place of the oldest in the columns.
     #[inline(always)]
     fn enter<L: Lanes>(&mut self, job: &Job, oldest: usize, y: usize) {
-        let (width, depth) = (job.width, job.depth);
-        let [scratch, second_scratch] = &mut self.scratch;
-        let Some(first) = job.pairs.first() else { return };
-        let (values, row) = (first.reference_row(y, width), first.candidates.row(y, width, depth, scratch));
-        let pixels = self.ring[oldest].chunks_exact_mut(depth).zip(self.columns.chunks_exact_mut(depth)).enumerate();
-        match job.pairs.get(1) {
-            None => {
-                for ((x, (old, column)), &value) in pixels.zip(values) {
-                    let hypotheses = blocks(at(row, x, depth));
-                    for ((block, old), column) in hypotheses.iter().zip(blocks_mut(old)).zip(blocks_mut(column)) {
-                        replace(truncated::<L>(value, block), job.halvings, old, column);
-                    }
-                }
-            }
-            Some(second) => {
-                let (second_values, second_row) = (second.reference_row(y, width), second.candidates.row(y, width, depth, second_scratch));
-                let penalty = L::splat(OCCLUSION_PENALTY);
-                for (((x, (old, column)), &value), &second_value) in pixels.zip(values).zip(second_values) {
-                    let hypotheses = blocks(at(row, x, depth)).iter().zip(blocks(at(second_row, x, depth)));
-                    for (((first, second), old), column) in hypotheses.zip(blocks_mut(old)).zip(blocks_mut(column)) {
-                        let (a, b) = (truncated::<L>(value, first), truncated::<L>(second_value, second));
-                        let lower = a.min(b);
-                        replace(a.add(b).min(lower.add(lower).add(penalty)), job.halvings, old, column);
-                    }
-                }
-            }
+        let [scratch, second] = &mut self.scratch;
+        let rows = CostRows::new(job, y, [scratch, second]);
+        for (x, (old, column)) in self.ring[oldest].iter_mut().zip(&mut self.columns).enumerate() {
+            rows.replace::<L, N>(job, x, old, column);
         }
     }
 
+    /// [`Self::enter`], (3) and the two paths that come from above and from the left, in one sweep.
     #[inline(always)]
-    fn means<L: Lanes>(&mut self, job: &Job) {
-        let (side, per_pixel) = (2 * job.radius + 1, job.depth / LANES);
-        let (columns, means) = (blocks(&self.columns), blocks_mut(&mut self.means));
-        for block in 0..per_pixel {
-            let mut sum = L::wide_zero();
-            for x in 0..side - 1 {
-                sum = L::wide_add(sum, L::load(&columns[x * per_pixel + block]));
-            }
-            let entering = &columns[(side - 1) * per_pixel..][..means.len()];
-            let mut at = block;
-            while at < means.len() {
-                sum = L::wide_add(sum, L::load(&entering[at]));
-                L::scaled(sum, job.scale).store(&mut means[at]);
-                sum = L::wide_sub(sum, L::load(&columns[at]));
-                at += per_pixel;
+    fn forwards<L: Lanes>(&mut self, job: &Job, oldest: usize, y: usize) {
+        let reach = 2 * job.radius;
+        let Self { ring, columns, means, down, down_least, sums, scratch: [scratch, second] } = self;
+        let rows = CostRows::new(job, y, [scratch, second]);
+        let (ring, width) = (&mut ring[oldest][..], means.len());
+        let mut window = [L::wide_zero(); N];
+        for x in 0..reach {
+            rows.replace::<L, N>(job, x, &mut ring[x], &mut columns[x]);
+            for k in 0..N {
+                window[k] = L::wide_add(window[k], L::load(&columns[x][k]));
             }
         }
-    }
-}
-
-/// The hypotheses of pixel x in a row of candidates.
-#[inline(always)]
-fn at((data, origin, per_x): (&[u8], isize, isize), x: usize, depth: usize) -> &[u8] {
-    &data[(origin + x as isize * per_x) as usize..][..depth]
-}
-
-/// Equation (1).
-#[inline(always)]
-fn truncated<L: Lanes>(value: u8, hypotheses: &[u8; LANES]) -> L {
-    L::splat(value).abs_diff(L::load(hypotheses)).min(L::splat(TRUNCATION))
-}
-
-/// A new cost takes the place of the oldest in its column.
-#[inline(always)]
-fn replace<L: Lanes>(mut cost: L, halvings: u32, old: &mut [u8; LANES], column: &mut [u8; LANES]) {
-    for _ in 0..halvings {
-        cost = cost.halved();
-    }
-    L::load(column).add(cost).sub(L::load(old)).store(column);
-    cost.store(old);
-}
-
-/// L of the three paths, and S.
-struct Paths {
-    /// Downward path at the row above and at this row, `[x][1 + h + 1]` with 255 at both ends.
-    down: [Vec<u8>; 2],
-    down_least: Vec<u8>,
-    /// The horizontal paths at two neighbouring pixels.
-    right: [Vec<u8>; 2],
-    left: [Vec<u8>; 2],
-    /// S of the row, `[x][h]`.
-    sums: Vec<u8>,
-}
-
-impl Paths {
-    fn new(width: usize, depth: usize) -> Self {
-        let pixel: Vec<u8> = std::iter::once(255).chain(std::iter::repeat_n(0, depth)).chain([255]).collect();
-        let pixels = || [pixel.clone(), pixel.clone()];
-        let down = || pixel.repeat(width);
-        Self { down: [down(), down()], down_least: vec![0; width], right: pixels(), left: pixels(), sums: vec![0; width * depth] }
-    }
-
-    /// Equation (4) along the next row with costs C.
-    #[inline(always)]
-    fn advance<L: Lanes>(&mut self, costs: &[u8], depth: usize) {
-        let width = self.down_least.len();
-        let Self { down: [above, down], right: [before, right], left: [after, left], sums, down_least } = self;
-        for (x, least) in down_least.iter_mut().enumerate() {
-            let (here, padded) = (x * depth, x * (depth + 2));
-            let (above, down) = (&above[padded..][..depth + 2], &mut down[padded..][..depth + 2]);
-            *least = step::<L, false>(&costs[here..][..depth], above, *least, down, &mut sums[here..][..depth]);
-        }
-        before[1..=depth].fill(0);
-        after[1..=depth].fill(0);
-        let (mut right_least, mut left_least) = (0, 0);
-        // Two chains side by side keep the processor busy while each waits for itself.
+        let (down, down_least, sums) = (&mut down[..width], &mut down_least[..width], &mut sums[..width]);
+        let mut right = [L::splat(0); N];
+        let mut right_least = L::splat(0);
         for x in 0..width {
-            let (here, there) = (x * depth, (width - 1 - x) * depth);
-            right_least = step::<L, true>(&costs[here..][..depth], before, right_least, right, &mut sums[here..][..depth]);
-            left_least = step::<L, true>(&costs[there..][..depth], after, left_least, left, &mut sums[there..][..depth]);
-            std::mem::swap(before, right);
-            std::mem::swap(after, left);
+            rows.replace::<L, N>(job, x + reach, &mut ring[x + reach], &mut columns[x + reach]);
+            let mut cost = [L::splat(0); N];
+            for k in 0..N {
+                window[k] = L::wide_add(window[k], L::load(&columns[x + reach][k]));
+                cost[k] = L::scaled(window[k], job.scale);
+                cost[k].store(&mut means[x][k]);
+                window[k] = L::wide_sub(window[k], L::load(&columns[x][k]));
+            }
+            let (below, least) = step(&cost, &loaded(&down[x]), L::splat(down_least[x]));
+            down_least[x] = least.first();
+            (right, right_least) = step(&cost, &right, right_least);
+            for k in 0..N {
+                below[k].store(&mut down[x][k]);
+                below[k].add(right[k]).store(&mut sums[x][k]);
+            }
         }
-        self.down.swap(0, 1);
+    }
+
+    /// The path from the right, and the winners of the three paths together. `values` are the reference's.
+    #[inline(always)]
+    fn backwards<L: Lanes>(&mut self, job: &Job, values: &[u8], out: Band) {
+        let mut left = [L::splat(0); N];
+        let mut least = L::splat(0);
+        let (first, last, width) = (job.range.start, job.range.end - 1, values.len());
+        let (means, sums) = (&self.means[..width], &self.sums[..width]);
+        let (best, cost, rival) = (&mut out.best[..width], &mut out.cost[..width], &mut out.rival[..width]);
+        for x in (0..width).rev() {
+            (left, least) = step(&loaded(&means[x]), &left, least);
+            let mut whole = [L::splat(0); N];
+            for k in 0..N {
+                whole[k] = L::load(&sums[x][k]).add(left[k]);
+            }
+            let winner = winner(&whole, &mut cost[x], &mut rival[x]);
+            best[x] = if values[x] == u8::MAX || first + winner > last { NO_MATCH } else { (first + winner) as u16 };
+        }
     }
 }
 
-/// One pixel of a path: L there from L and its least value at the pixel before, written or added to the sums. Returns the
-/// least.
-#[inline(always)]
-fn step<L: Lanes, const ADD: bool>(costs: &[u8], before: &[u8], before_least: u8, here: &mut [u8], sums: &mut [u8]) -> u8 {
-    let [small, large] = STEP_PENALTIES;
-    let (small, jump, least) = (L::splat(small), L::splat(before_least + large), L::splat(before_least));
-    let mut lowest = L::splat(255);
-    let count = costs.len();
-    let before = blocks(before).iter().zip(blocks(&before[1..=count])).zip(blocks(&before[2..]));
-    let inout = blocks(costs).iter().zip(blocks_mut(&mut here[1..=count])).zip(blocks_mut(sums));
-    for (((below, at), above), ((cost, here), sum)) in before.zip(inout) {
-        let beside = L::load(below).min(L::load(above)).add_to_top(small);
-        let value = L::load(at).min(beside).min(jump).sub(least).add(L::load(cost));
-        lowest = lowest.min(value);
-        value.store(here);
-        if ADD { L::load(sum).add(value) } else { value }.store(sum);
+/// A row of the reference and the hypotheses of its pixels, for each pair.
+struct CostRows<'a> {
+    first: (&'a [u8], (&'a [u8], isize, isize)),
+    second: Option<(&'a [u8], (&'a [u8], isize, isize))>,
+}
+
+impl<'a> CostRows<'a> {
+    fn new(job: &'a Job, y: usize, [scratch, second_scratch]: [&'a mut Vec<u8>; 2]) -> Self {
+        let of = |pair: &'a PairRows, scratch| (pair.reference_row(y, job.width), pair.candidates.row(y, job.width, job.depth, scratch));
+        Self { first: of(&job.pairs[0], scratch), second: job.pairs.get(1).map(|pair| of(pair, second_scratch)) }
     }
-    lowest.smallest()
+
+    /// The costs of pixel x take the place of the oldest in its column.
+    #[inline(always)]
+    fn replace<L: Lanes, const N: usize>(&self, job: &Job, x: usize, old: &mut Pixel<N>, column: &mut Pixel<N>) {
+        let mut cost = truncated::<L, N>(&self.first, x);
+        if let Some(second) = &self.second {
+            let other = truncated::<L, N>(second, x);
+            for k in 0..N {
+                let lower = cost[k].min(other[k]);
+                cost[k] = cost[k].add(other[k]).min(lower.add(lower).add(L::splat(OCCLUSION_PENALTY)));
+            }
+        }
+        for k in 0..N {
+            for _ in 0..job.halvings {
+                cost[k] = cost[k].halved();
+            }
+            L::load(&column[k]).add(cost[k]).sub(L::load(&old[k])).store(&mut column[k]);
+            cost[k].store(&mut old[k]);
+        }
+    }
+}
+
+/// Equation (1) at pixel x.
+#[inline(always)]
+fn truncated<L: Lanes, const N: usize>((values, (data, origin, per_x)): &(&[u8], (&[u8], isize, isize)), x: usize) -> [L; N] {
+    let value = L::splat(values[x]);
+    let hypotheses = &data[(origin + x as isize * per_x) as usize..][..N * LANES].as_chunks::<LANES>().0[..N];
+    let mut cost = [value; N];
+    for k in 0..N {
+        cost[k] = value.abs_diff(L::load(&hypotheses[k])).min(L::splat(TRUNCATION));
+    }
+    cost
+}
+
+#[inline(always)]
+fn loaded<L: Lanes, const N: usize>(pixel: &Pixel<N>) -> [L; N] {
+    let mut out = [L::splat(0); N];
+    for k in 0..N {
+        out[k] = L::load(&pixel[k]);
+    }
+    out
+}
+
+/// Equation (4): a path one pixel on, from L and its least value at the pixel before; and its least value there.
+#[inline(always)]
+fn step<L: Lanes, const N: usize>(costs: &[L; N], before: &[L; N], before_least: L) -> ([L; N], L) {
+    let [small, large] = STEP_PENALTIES.map(L::splat);
+    let (end, jump) = (L::splat(u8::MAX), before_least.add(large));
+    let (mut here, mut least) = (*costs, end);
+    for k in 0..N {
+        let below = before[k].raised(if k > 0 { before[k - 1] } else { end });
+        let above = before[k].lowered(if k + 1 < N { before[k + 1] } else { end });
+        let beside = below.min(above).add_to_top(small);
+        here[k] = before[k].min(beside).min(jump).sub(before_least).add(costs[k]);
+        least = least.min(here[k]);
+    }
+    (here, least.least())
 }
 
 /// Three bytes that no minimum takes, in a row of bytes that any minimum takes.
@@ -531,35 +562,33 @@ const MIDDLE: [u8; 2 * LANES + 3] = {
     row
 };
 
-/// The winners of one row from its values and S, written from pixel `to` on.
+/// The winner of a pixel from its S, with its costs and rival.
 #[inline(always)]
-fn winners<L: Lanes>(job: &Job, values: &[u8], sums: &[u8], found: &mut Matches, to: usize) {
-    let (first, last) = (job.range.start, job.range.end - 1);
-    for (x, sums) in sums.chunks_exact(job.depth).enumerate() {
-        let mut low = L::splat(255);
-        for block in blocks(sums) {
-            low = low.min(L::load(block));
-        }
-        let lowest = low.smallest();
-        let mut best = 0;
-        for (k, block) in blocks(sums).iter().enumerate() {
-            let bits = L::load(block).equal(lowest);
-            if bits != 0 {
-                best = k * LANES + bits.trailing_zeros() as usize;
-                break;
-            }
-        }
-        let mut low = L::splat(255);
-        for (k, block) in blocks(sums).iter().enumerate() {
-            let shift = (k * LANES + LANES + 1).saturating_sub(best).min(LANES + 3);
-            let beside = blocks(&MIDDLE[shift..]).first().unwrap_or(block);
-            low = low.min(L::load(block).or(L::load(beside)));
-        }
-        found.rival[to + x] = low.smallest();
-        let below = if best > 0 { sums[best - 1] } else { u8::MAX };
-        found.cost[to + x] = [below, lowest, sums.get(best + 1).copied().unwrap_or(u8::MAX)];
-        found.best[to + x] = if values[x] == u8::MAX || first + best > last { NO_MATCH } else { (first + best) as u16 };
+fn winner<L: Lanes, const N: usize>(sums: &[L; N], cost: &mut [u8; 3], rival: &mut u8) -> usize {
+    let mut least = sums[0];
+    for sum in &sums[1..] {
+        least = least.min(*sum);
     }
+    let least = least.least();
+    let mut best = 0;
+    for k in (0..N).rev() {
+        let bits = sums[k].equal(least);
+        best = if bits != 0 { k * LANES + bits.trailing_zeros() as usize } else { best };
+    }
+    let mut other = L::splat(u8::MAX);
+    let mut stored = [[0; LANES]; N];
+    for k in 0..N {
+        let shift = (k * LANES + LANES + 1).saturating_sub(best).min(LANES + 3);
+        if let Some(beside) = MIDDLE[shift..].first_chunk() {
+            other = other.min(sums[k].or(L::load(beside)));
+        }
+        sums[k].store(&mut stored[k]);
+    }
+    *rival = other.least().first();
+    let stored = stored.as_flattened();
+    let below = if best > 0 { stored[best - 1] } else { u8::MAX };
+    *cost = [below, least.first(), stored.get(best + 1).copied().unwrap_or(u8::MAX)];
+    best
 }
 
 #[cfg(test)]
@@ -700,10 +729,11 @@ mod tests {
     fn both_instruction_sets_give_the_same() {
         let pairs = [pair(2, [-1.0, 0.0]), pair(3, [0.0, 1.0])];
         let region = Region { x: [4, 50], y: [3, 37] };
-        let job = Job::new(&pairs, region, 5..90, 2);
-        let plain = best_band_with::<[u8; LANES]>(&job, 7..30);
-        assert_eq!(plain.best.len(), 46 * 23);
-        assert_eq!(best_band(&job, 7..30), plain);
+        let found = correlate(&pairs, region, 5..90, 2);
+        let (mut best, mut cost, mut rival) = (vec![0; 46 * 34], vec![[0; 3]; 46 * 34], vec![0; 46 * 34]);
+        let band = Band { best: &mut best, cost: &mut cost, rival: &mut rival };
+        match_band_with::<[u8; LANES]>(&Job::new(&pairs, region, 5..90, 2), 0, band);
+        assert_eq!((found.best, found.cost, found.rival), (best, cost, rival));
     }
 
     #[test]

@@ -254,9 +254,14 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
 fn points(rectification: &Rectification, reference: &(StereoView, ViewDisparity), disparity: &Plane, options: &CloudOptions) -> Cloud {
     let (prepared, found) = reference;
     let all_views = rectification.views.len() as f32 - 1.0;
-    let share = |bits: u8| bits.count_ones() as f32 / all_views;
-    let values = found.distinct.iter().zip(&found.confirmed).map(|(distinct, bits)| distinct * share(*bits)).collect();
-    let confidence = Plane::from_raw(disparity.width(), disparity.height(), values).expect("same size");
+    let (matches, width) = (&found.matches, disparity.width() as usize);
+    let mut confidence = Plane::new(disparity.width(), disparity.height());
+    for (j, (cost, rival)) in matches.cost.iter().zip(&matches.rival).enumerate() {
+        let region = matches.region;
+        let i = (region.y[0] + j / region.width()) * width + region.x[0] + j % region.width();
+        let distinct = 1.0 - f32::from(cost[1]) / f32::from((*rival).max(1));
+        confidence.as_mut()[i] = distinct.clamp(0.0, 1.0) * found.confirmed[j].count_ones() as f32 / all_views;
+    }
     let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, disparity, &confidence, &prepared.plane));
     match options.voxel_m {
         Some(side) => tidy::thin(cloud, side),

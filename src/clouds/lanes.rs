@@ -6,18 +6,6 @@
 /// Number of bytes in a block.
 pub const LANES: usize = 32;
 
-/// The whole blocks of a row of bytes.
-#[inline(always)]
-pub fn blocks(row: &[u8]) -> &[[u8; LANES]] {
-    row.as_chunks().0
-}
-
-/// The whole blocks of a row of bytes.
-#[inline(always)]
-pub fn blocks_mut(row: &mut [u8]) -> &mut [[u8; LANES]] {
-    row.as_chunks_mut().0
-}
-
 /// A block of [`LANES`] unsigned bytes.
 pub trait Lanes: Copy {
     /// As many 16-bit numbers, in an order of its own.
@@ -36,9 +24,15 @@ pub trait Lanes: Copy {
     fn or(self, other: Self) -> Self;
     /// Half, rounded up.
     fn halved(self) -> Self;
-    fn smallest(self) -> u8;
-    /// Bit i is set where byte i equals `value`.
-    fn equal(self, value: u8) -> u32;
+    /// The least byte in all places.
+    fn least(self) -> Self;
+    fn first(self) -> u8;
+    /// Bit i is set where byte i equals the other's.
+    fn equal(self, other: Self) -> u32;
+    /// Every byte one place up, the last of `before` first.
+    fn raised(self, before: Self) -> Self;
+    /// Every byte one place down, the first of `after` last.
+    fn lowered(self, after: Self) -> Self;
     fn wide_zero() -> Self::Wide;
     fn wide_add(wide: Self::Wide, other: Self) -> Self::Wide;
     fn wide_sub(wide: Self::Wide, other: Self) -> Self::Wide;
@@ -98,12 +92,24 @@ impl Lanes for [u8; LANES] {
         each(|i| self[i].div_ceil(2))
     }
     #[inline(always)]
-    fn smallest(self) -> u8 {
-        self.into_iter().fold(255, u8::min)
+    fn least(self) -> Self {
+        [self.into_iter().fold(u8::MAX, u8::min); LANES]
     }
     #[inline(always)]
-    fn equal(self, value: u8) -> u32 {
-        (0..LANES).fold(0, |bits, i| bits | u32::from(self[i] == value) << i)
+    fn first(self) -> u8 {
+        self[0]
+    }
+    #[inline(always)]
+    fn equal(self, other: Self) -> u32 {
+        (0..LANES).fold(0, |bits, i| bits | u32::from(self[i] == other[i]) << i)
+    }
+    #[inline(always)]
+    fn raised(self, before: Self) -> Self {
+        each(|i| if i > 0 { self[i - 1] } else { before[LANES - 1] })
+    }
+    #[inline(always)]
+    fn lowered(self, after: Self) -> Self {
+        each(|i| if i + 1 < LANES { self[i + 1] } else { after[0] })
     }
     #[inline(always)]
     fn wide_zero() -> Self::Wide {
@@ -184,16 +190,35 @@ pub mod avx2 {
             Self(unsafe { _mm256_avg_epu8(self.0, _mm256_setzero_si256()) })
         }
         #[inline(always)]
-        fn smallest(self) -> u8 {
+        fn least(self) -> Self {
             unsafe {
                 let half = _mm_min_epu8(_mm256_castsi256_si128(self.0), _mm256_extracti128_si256::<1>(self.0));
+                // The shift brings a zero above each byte, and so does the minimum.
                 let pairs = _mm_min_epu8(half, _mm_srli_epi16::<8>(half));
-                _mm_extract_epi16::<0>(_mm_minpos_epu16(_mm_and_si128(pairs, _mm_set1_epi16(0xff)))) as u8
+                Self(_mm256_broadcastb_epi8(_mm_minpos_epu16(pairs)))
             }
         }
         #[inline(always)]
-        fn equal(self, value: u8) -> u32 {
-            unsafe { _mm256_movemask_epi8(_mm256_cmpeq_epi8(self.0, _mm256_set1_epi8(value as i8))) as u32 }
+        fn first(self) -> u8 {
+            unsafe { _mm256_extract_epi8::<0>(self.0) as u8 }
+        }
+        #[inline(always)]
+        fn equal(self, other: Self) -> u32 {
+            unsafe { _mm256_movemask_epi8(_mm256_cmpeq_epi8(self.0, other.0)) as u32 }
+        }
+        #[inline(always)]
+        fn raised(self, before: Self) -> Self {
+            unsafe {
+                let straddling = _mm256_permute2x128_si256::<0x21>(before.0, self.0);
+                Self(_mm256_alignr_epi8::<15>(self.0, straddling))
+            }
+        }
+        #[inline(always)]
+        fn lowered(self, after: Self) -> Self {
+            unsafe {
+                let straddling = _mm256_permute2x128_si256::<0x21>(self.0, after.0);
+                Self(_mm256_alignr_epi8::<1>(straddling, self.0))
+            }
         }
         #[inline(always)]
         fn wide_zero() -> Self::Wide {

@@ -15,6 +15,10 @@ use rayon::prelude::*;
 /// c of (1), grey levels times 4 per pixel: smaller drowns edges in noise, larger lets one strong edge outvote its window.
 const CAP: f32 = 31.0;
 
+/// Adding 1.5 2^23 rounds a number to the last bit of its mantissa, whose low byte is then the integer; that of NaN is 0. Much
+/// faster than a conversion that has to think of NaN.
+const ROUND_TO_128: f32 = 12_582_912.0 + 128.0;
+
 /// The picture of equation (1), 97 to 159; 0 where a pixel or a neighbour is NaN. Borders are replicated.
 pub fn gradient(plane: &Plane, along: Vector2<f64>) -> GrayImage {
     let (width, height) = (plane.width() as usize, plane.height() as usize);
@@ -60,8 +64,7 @@ fn gradient_row_plain([above, here, below]: [&[f32]; 3], [right, down]: [f32; 2]
     for x in 0..width {
         let across = smooth.1[x] - smooth.0[x];
         let along = slope.0[x] + 2.0 * slope.1[x] + slope.2[x];
-        // NaN becomes 0.
-        out[x] = (128.5 + (right * across + down * along).clamp(-CAP, CAP)) as u8;
+        out[x] = (ROUND_TO_128 + (right * across + down * along).clamp(-CAP, CAP)).to_bits() as u8;
     }
 }
 
@@ -122,7 +125,7 @@ mod tests {
     fn diagonal_gradient_is_the_mean_of_both() {
         let plane = Plane::from_fn(9, 9, |x, y| image::Luma([2.0 * x as f32 + 0.5 * y as f32]));
         let diagonal = gradient(&plane, Vector2::new(1.0, 1.0));
-        assert_eq!(diagonal.get_pixel(4, 4).0[0], (128.5 + 8.0 * 2.5 / 2f32.sqrt()) as u8);
+        assert_eq!(diagonal.get_pixel(4, 4).0[0], (128.0 + 8.0 * 2.5 / 2f32.sqrt()).round() as u8);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Dense disparities of two or three rectified views, seen from one of them.
 
-use super::correlate::{Matches, NO_MATCH, Pair, Region, correlate};
+use super::correlate::{Matches, Pair, Region, correlate};
 use super::subpixel::equiangular;
 use super::{prefilter, validate};
 use crate::rig::rectify::Plane;
@@ -44,10 +44,9 @@ pub struct StereoView {
 pub struct ViewDisparity {
     /// Validated sub-pixel disparities, px; NaN elsewhere.
     pub disparity: Plane,
-    /// Bits of the other views (in order, this one left out) that confirm a pixel.
+    /// Bits of the other views (in order, this one left out) that confirm a pixel of the region.
     pub confirmed: Vec<u8>,
-    /// 0 (as good as a rival) to 1 (no rival).
-    pub distinct: Plane,
+    pub matches: Matches,
 }
 
 /// Matches every view against the others; `regions` say where each is searched, `range` the disparities first..=last.
@@ -74,39 +73,18 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let matches = correlate(&pairs, region, hypotheses, options.radius);
     let confirmed = validate::confirmed(&matches, &pairs, (f64::from(options.consistency_px) * per_px) as u16);
     let (width, height) = here.plane.dimensions();
-    let mut found = ViewDisparity {
-        disparity: Plane::from_pixel(width, height, Luma([f32::NAN])),
-        confirmed: vec![0; (width * height) as usize],
-        distinct: Plane::new(width, height),
-    };
-    found.write(&matches, &confirmed, per_px as f32, options);
-    validate::remove_speckles(&mut found.disparity, options.speckle_area_px, options.speckle_step_px);
-    found
-}
-
-impl ViewDisparity {
-    /// Takes over the pixels of a region that are unique and confirmed.
-    fn write(&mut self, matches: &Matches, confirmed: &[u8], per_px: f32, options: &StereoOptions) {
-        let (width, region) = (self.disparity.width() as usize, matches.region);
-        let values: &mut [f32] = &mut self.disparity;
-        let distinct: &mut [f32] = &mut self.distinct;
-        let rows = values.par_chunks_exact_mut(width).zip(distinct.par_chunks_exact_mut(width)).zip(self.confirmed.par_chunks_exact_mut(width));
-        rows.skip(region.y[0]).take(region.height()).enumerate().for_each(|(y, ((values, distinct), bits))| {
-            for x in 0..region.width() {
-                let i = y * region.width() + x;
-                let (best, cost, rival) = (matches.best[i], matches.cost[i], matches.rival[i]);
-                if best == NO_MATCH || confirmed[i] == 0 || !validate::unique(cost[1], rival, options.uniqueness) {
-                    continue;
-                }
-                if let Some(offset) = equiangular(cost) {
-                    let x = region.x[0] + x;
-                    values[x] = (f32::from(best) + offset) / per_px;
-                    distinct[x] = 1.0 - f32::from(cost[1]) / f32::from(rival.max(1));
-                    bits[x] = confirmed[i];
-                }
+    let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    let rows = disparity.par_chunks_exact_mut(width as usize).skip(region.y[0]).take(region.height());
+    rows.enumerate().for_each(|(y, row)| {
+        for (i, value) in (y * region.width()..).zip(&mut row[region.x[0]..region.x[1]]) {
+            let cost = matches.cost[i];
+            if confirmed[i] != 0 && validate::unique(cost[1], matches.rival[i], options.uniqueness) {
+                *value = equiangular(cost).map_or(f32::NAN, |offset| (f32::from(matches.best[i]) + offset) / per_px as f32);
             }
-        });
-    }
+        }
+    });
+    validate::remove_speckles(&mut disparity, options.speckle_area_px, options.speckle_step_px);
+    ViewDisparity { disparity, confirmed, matches }
 }
 
 fn others_of(views: &[StereoView], k: usize) -> impl Iterator<Item = &StereoView> {

@@ -10,8 +10,9 @@
 //! A bar for texture is left out: where there is none, rivals are as good as the winner, and a bar that adds anything to
 //! uniqueness takes bare skin first.
 
-use super::correlate::{Matches, NO_MATCH, Pair, pixel};
+use super::correlate::{Matches, NO_MATCH, Pair};
 use crate::rig::rectify::Plane;
+use image::GrayImage;
 use rayon::prelude::*;
 
 /// Whether the winner of a pixel stands alone.
@@ -19,14 +20,8 @@ pub fn unique(cost: u8, rival: u8, ratio: f32) -> bool {
     f32::from(rival) > f32::from(cost) * (1.0 + ratio)
 }
 
-/// What a view says of a pixel.
-#[derive(Clone, Copy, PartialEq)]
-enum Verdict {
-    Confirmed,
-    /// Something nearer stands there, or the place is out of view.
-    Hidden,
-    Contradicted,
-}
+/// Set beside the views' own bits where any contradicts.
+const CONTRADICTED: u8 = 1 << 7;
 
 /// Bits of the other views of `pairs` that confirm each pixel of the region, none where any contradicts.
 pub fn confirmed(matches: &Matches, pairs: &[Pair], tolerance: u16) -> Vec<u8> {
@@ -35,18 +30,16 @@ pub fn confirmed(matches: &Matches, pairs: &[Pair], tolerance: u16) -> Vec<u8> {
     let mut bits = vec![0u8; matches.best.len()];
     bits.par_chunks_exact_mut(region.width().max(1)).enumerate().for_each(|(y, bits)| {
         let best = &matches.best[y * region.width()..][..region.width()];
-        for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate().filter(|(_, (_, h))| **h != NO_MATCH) {
-            for (k, owners) in owners.iter().enumerate() {
-                match owners.verdict([x, y], h, tolerance) {
-                    Verdict::Confirmed => *bits |= 1 << k,
-                    Verdict::Hidden => {}
-                    Verdict::Contradicted => {
-                        *bits = 0;
-                        break;
-                    }
-                }
+        for (k, owners) in owners.iter().enumerate() {
+            let keys = &owners.keys[y * owners.width..];
+            for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
+                let Some(shift) = owners.shifts.get(usize::from(h)) else { continue };
+                let owner = keys[x + *shift as usize] as u16;
+                *bits |= u8::from(owner.abs_diff(h) <= tolerance) << k;
+                *bits |= if owner < h.saturating_sub(tolerance) { CONTRADICTED } else { 0 };
             }
         }
+        bits.iter_mut().for_each(|bits| *bits = if *bits & CONTRADICTED != 0 { 0 } else { *bits });
     });
     bits
 }
@@ -79,23 +72,25 @@ impl Owners {
             }
         }
         let start = [matches.region.x[0] as isize + left, matches.region.y[0] as isize + top];
-        for (y, keys) in keys.chunks_exact_mut(wide.max(1)).enumerate() {
-            for (x, key) in keys.iter_mut().enumerate() {
-                if pixel(&pair.other, start[0] + x as isize, start[1] + y as isize) == 0 {
-                    *key = NO_MATCH.into();
-                }
-            }
-        }
+        hide_unknown(&mut keys, wide, &pair.other, start);
         Self { keys, width: wide, shifts }
     }
+}
 
-    #[inline]
-    fn verdict(&self, [x, y]: [usize; 2], h: u16, tolerance: u16) -> Verdict {
-        match self.keys[y * self.width + x + self.shifts[usize::from(h)] as usize] as u16 {
-            owner if owner.abs_diff(h) <= tolerance => Verdict::Confirmed,
-            owner if owner > h => Verdict::Hidden,
-            _ => Verdict::Contradicted,
+/// Marks the places of `keys`, whose first is pixel `start`, that the picture does not show.
+fn hide_unknown(keys: &mut [u32], wide: usize, picture: &GrayImage, start: [isize; 2]) {
+    let (width, height) = (picture.width() as isize, picture.height() as isize);
+    let (from, to) = (start[0].clamp(0, width), (start[0] + wide as isize).clamp(0, width));
+    for (y, keys) in (start[1]..).zip(keys.chunks_exact_mut(wide.max(1))) {
+        if y < 0 || y >= height || from >= to {
+            keys.fill(NO_MATCH.into());
+            continue;
         }
+        let (first, count) = ((from - start[0]) as usize, (to - from) as usize);
+        let known = &picture.as_raw()[(y * width + from) as usize..][..count];
+        keys[..first].fill(NO_MATCH.into());
+        keys[first + count..].fill(NO_MATCH.into());
+        keys[first..].iter_mut().zip(known).for_each(|(key, &value)| *key = if value == 0 { NO_MATCH.into() } else { *key });
     }
 }
 
@@ -171,7 +166,7 @@ fn join(parents: &mut [u32], a: usize, b: usize) {
 mod tests {
     use super::*;
     use crate::clouds::correlate::Region;
-    use image::{GrayImage, Luma};
+    use image::Luma;
     use nalgebra::Vector2;
 
     #[test]
