@@ -323,7 +323,7 @@ mod tests {
                 name: format!("cam_0{k}"),
                 size_px: [640, 480],
                 matrix: nalgebra::Matrix3::from_row_slice(&rows),
-                distortion: [d[0], d[1], d[2], d[3], 0.0],
+                lens: crate::rig::Lens::brown_conrady(&d).unwrap(),
                 camera_from_world: nalgebra::Rotation3::new(nalgebra::Vector3::from_column_slice(&numbers(&t["rotation"]))),
                 translation: nalgebra::Vector3::from_column_slice(&numbers(&t["translation"])),
             }
