@@ -45,8 +45,8 @@ const TRUNCATION: u8 = 24;
 const OCCLUSION_PENALTY: u8 = 16;
 /// P1 and P2 of (4), half grey levels.
 pub(super) const STEP_PENALTIES: [u8; 2] = [12, 32];
-/// Rows of a band; more are slower to share out, fewer warm up more often.
-const BAND_ROWS: usize = 120;
+/// Rows of a band; more are slower to share out (frames are shared out too), fewer warm up more often.
+const BAND_ROWS: usize = 240;
 /// Rows until a path has forgotten where it began.
 const WARM_UP_ROWS: usize = 6;
 /// Largest r of (3).
