@@ -1,4 +1,6 @@
 //! One file per subcommand: load, call the library, save, report.
+mod board;
+mod calibrate;
 mod check;
 mod clouds;
 mod demo;
@@ -32,6 +34,10 @@ enum Command {
     Demo(demo::DemoArgs),
     /// What is wrong with a session and what to do, before any long work
     Check(check::CheckArgs),
+    /// A rig from pictures of a chessboard or ChArUco board
+    Calibrate(calibrate::CalibrateArgs),
+    /// A calibration board to print
+    Board(board::BoardArgs),
     /// The person's point cloud in every frame of a session, as PLY files
     Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
@@ -66,6 +72,8 @@ pub fn run(cli: Cli) -> Result<()> {
     match cli.command {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
+        Command::Board(args) => board::run(&args),
         Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),

@@ -1,13 +1,13 @@
 //! Calibration boards: their geometry, their corners in pictures.
 //!
 //! Chessboards by cv::findChessboardCornersSB (Duda and Frese 2018, "Accurate detection and localization of checkerboard
-//! corners for calibration"), where that fails with other flags, at last by cv::findChessboardCorners; ChArUco boards by
-//! cv::aruco, in the picture and in its negative. All corners are then fitted by [`super::corner`], which also tells false
+//! corners for calibration"), where that fails by cv::findChessboardCorners; ChArUco boards by cv::aruco, in the picture
+//! and in its negative. All corners are then fitted by [`super::corner`], which also tells false
 //! ones: a board of which not half the corners look like corners is none. Corners are numbered so that they run
 //! clockwise (x right, y down as printed) and, where the colours allow it, so that the square after corner 0 is dark.
 //!
-//! OpenCV 4.6: on its 13 stereo pairs the first detector alone misses some boards and the last one none; together they find
-//! all 26. Checked against OpenCV's reference corners and on boards that this module drew.
+//! OpenCV 4.6 on its own 13 stereo pairs: findChessboardCornersSB with its default flags misses the board in left04, left05,
+//! right01 and right04, exhaustively in left05, oversampling in none; findChessboardCorners in none. Checked against OpenCV's reference corners and on boards that this module drew.
 
 use super::corner::{Refined, refine};
 use crate::rig::calibrate::homography::{carried_jacobian, homography};
@@ -34,7 +34,9 @@ pub enum BoardError {
     Corners { columns: usize, rows: usize },
     #[error("squares of {square_m} m are impossible; give the side of one square in metres, such as 0.025")]
     Square { square_m: f64 },
-    #[error("markers of {marker_m} m do not fit into squares of {square_m} m; give the side of the black marker in metres, smaller than the square")]
+    #[error(
+        "markers of {marker_m} m do not fit into squares of {square_m} m; give the side of the black marker in metres, smaller than the square"
+    )]
     Marker { marker_m: f64, square_m: f64 },
     #[error("{name} is no dictionary of markers; known are {}", DICTIONARIES.map(|d| d.0).join(", "))]
     Dictionary { name: String },
@@ -230,37 +232,28 @@ fn as_mat(image: &GrayImage) -> opencv::Result<opencv::boxed_ref::BoxedRef<'_, M
 /// A way to look for chessboards.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Detector {
-    /// cv::findChessboardCornersSB with these flags.
-    SectorBased(i32),
+    /// cv::findChessboardCornersSB, oversampling (CALIB_CB_ACCURACY).
+    SectorBased,
     /// cv::findChessboardCorners.
     Classic,
 }
 
-/// In this order until one finds the board: each finds boards that others miss.
-pub const DETECTORS: [Detector; 3] = [
-    Detector::SectorBased(calib3d::CALIB_CB_ACCURACY),
-    Detector::SectorBased(calib3d::CALIB_CB_ACCURACY | calib3d::CALIB_CB_EXHAUSTIVE),
-    Detector::Classic,
-];
-
 fn find_chessboard(image: &GrayImage, columns: usize, rows: usize) -> Result<Option<Corners>, BoardError> {
-    for detector in DETECTORS {
-        if let Some(found) = find_chessboard_by(detector, image, columns, rows)? {
-            return Ok(Some(found));
-        }
+    match find_chessboard_by(Detector::SectorBased, image, columns, rows)? {
+        Some(found) => Ok(Some(found)),
+        None => find_chessboard_by(Detector::Classic, image, columns, rows),
     }
-    Ok(None)
 }
 
 /// All corners of a chessboard, numbered row by row and clockwise, as one detector finds them.
 pub fn find_chessboard_by(detector: Detector, image: &GrayImage, columns: usize, rows: usize) -> Result<Option<Corners>, BoardError> {
-    let size = Size::new(columns as i32, rows as i32);
+    let (size, mat) = (Size::new(columns as i32, rows as i32), as_mat(image)?);
     let mut corners = Vector::<Point2f>::new();
     let found = match detector {
-        Detector::SectorBased(flags) => calib3d::find_chessboard_corners_sb(&as_mat(image)?, size, &mut corners, flags)?,
+        Detector::SectorBased => calib3d::find_chessboard_corners_sb(&mat, size, &mut corners, calib3d::CALIB_CB_ACCURACY)?,
         Detector::Classic => {
             let flags = calib3d::CALIB_CB_ADAPTIVE_THRESH | calib3d::CALIB_CB_NORMALIZE_IMAGE | calib3d::CALIB_CB_FAST_CHECK;
-            calib3d::find_chessboard_corners(&as_mat(image)?, size, &mut corners, flags)?
+            calib3d::find_chessboard_corners(&mat, size, &mut corners, flags)?
         }
     };
     if !found || corners.len() != columns * rows {
@@ -284,11 +277,12 @@ fn polish(
     let on_board: Vec<_> = corners.iter().map(|(id, _)| target.points[*id] / square_m).collect();
     let pixels: Vec<_> = corners.iter().map(|(_, pixel)| pixel.coords).collect();
     let h = homography(&on_board, &pixels)?;
-    let fit = |((id, pixel), at): (&(usize, Point2<f64>), &Vector2<f64>)| match refine(image, pixel, &carried_jacobian(&h, at), margin_squares) {
-        Refined::Fitted(corner) => Some((*id, corner.pixel, corner.contrast)),
-        Refined::TooSmall => Some((*id, *pixel, 0.0)),
-        Refined::NoCorner => None,
-    };
+    let fit =
+        |((id, pixel), at): (&(usize, Point2<f64>), &Vector2<f64>)| match refine(image, pixel, &carried_jacobian(&h, at), margin_squares) {
+            Refined::Fitted(corner) => Some((*id, corner.pixel, corner.contrast)),
+            Refined::TooSmall => Some((*id, *pixel, 0.0)),
+            Refined::NoCorner => None,
+        };
     let polished: Vec<_> = corners.iter().zip(&on_board).filter_map(fit).collect();
     (polished.len() as f64 >= LEAST_SHARE * corners.len() as f64).then_some(polished)
 }
@@ -327,7 +321,7 @@ mod tests {
         refused(Board::charuco([5, 7], 0.03, 0.04, "4X4_50", false), "do not fit into squares of 0.03 m");
         refused(Board::charuco([5, 7], 0.04, 0.03, "4X4_40", false), "4X4_40 is no dictionary of markers; known are DICT_4X4_50,");
         refused(Board::charuco([12, 12], 0.04, 0.03, "4X4_50", false), "needs 72 markers, DICT_4X4_50 has 50");
-        assert!(Board::charuco([5, 7], 0.04, 0.03, "dict_april" , false).is_err());
+        assert!(Board::charuco([5, 7], 0.04, 0.03, "dict_april", false).is_err());
         assert!(Board::charuco([5, 7], 0.04, 0.03, "apriltag_36h11", false).is_ok());
     }
 
@@ -348,8 +342,8 @@ mod tests {
         let truth = true_corners(&folder.join("truth/corners.csv"));
         let board = Board::chessboard(9, 6, 0.04).unwrap();
         let target = board.target().unwrap();
-        let (mut ours, mut sector_based, mut classic, mut largest, mut count, mut misses) = (0.0, 0.0, 0.0, 0.0f64, 0.0, 0);
-        for (view, camera) in (0..18).flat_map(|v| (0..3).map(move |c| (v, c))) {
+        let (mut ours, mut sector_based, mut classic, mut largest, mut count, mut misses) = (0.0, 0.0, 0.0, 0.0f64, 0.0, 0u32);
+        for (view, camera) in (0..18).step_by(3).flat_map(|v| (0..3).map(move |c| (v, c))) {
             let image = read_grey(&folder.join(format!("cam_{camera:02}/{view:06}.png"))).unwrap();
             let expected = |id: usize| truth.iter().find(|t| (t.0, t.1, t.2) == (view, camera, id)).unwrap().3;
             let found = board.find(&image, &target).unwrap().unwrap();
@@ -366,7 +360,8 @@ mod tests {
                 let mut pixels: Vector<Point2f> = found.iter().map(|(_, p)| Point2f::new(p.x as f32, p.y as f32)).collect();
                 if refined {
                     let criteria = core::TermCriteria::new(3, 50, 1e-4).unwrap();
-                    opencv::imgproc::corner_sub_pix(&as_mat(&image).unwrap(), &mut pixels, Size::new(5, 5), Size::new(-1, -1), criteria).unwrap();
+                    opencv::imgproc::corner_sub_pix(&as_mat(&image).unwrap(), &mut pixels, Size::new(5, 5), Size::new(-1, -1), criteria)
+                        .unwrap();
                 }
                 let error = |p: Point2f| {
                     let p = Point2::new(f64::from(p.x), f64::from(p.y));
@@ -374,14 +369,18 @@ mod tests {
                 };
                 pixels.iter().map(error).sum()
             };
-            let sector = by(DETECTORS[0], false);
+            let sector = by(Detector::SectorBased, false);
             sector_based += sector;
-            misses += usize::from(sector == 0.0);
+            misses += u32::from(sector == 0.0);
             classic += by(Detector::Classic, true);
         }
         let rms = |sum: f64| (sum / count / 2.0).sqrt();
-        let sector_rms = (sector_based / f64::from(54 - misses) / 54.0 / 2.0).sqrt();
-        println!("error per coordinate: ours {:.4} px, largest {largest:.3}; SB {sector_rms:.4}, {misses} missed; cornerSubPix {:.4}", rms(ours), rms(classic));
+        let sector_rms = (sector_based / f64::from(18 - misses) / 54.0 / 2.0).sqrt();
+        println!(
+            "error per coordinate: ours {:.4} px, largest {largest:.3}; SB {sector_rms:.4}, {misses} missed; cornerSubPix {:.4}",
+            rms(ours),
+            rms(classic)
+        );
         assert!(rms(ours) < 0.04 && rms(ours) < 0.8 * rms(classic).min(sector_rms));
     }
 
@@ -390,20 +389,19 @@ mod tests {
         let Some(folder) = data("opencv-stereo-chessboard") else { return };
         let board = Board::chessboard(9, 6, 1.0).unwrap();
         let target = board.target().unwrap();
-        let mut lost = vec![Vec::new(); DETECTORS.len() + 1];
-        let plain = Detector::SectorBased(0);
+        let mut missed = Vec::new();
         for name in ["left", "right"].into_iter().flat_map(|s| (1..15).filter(|k| *k != 10).map(move |k| format!("{s}{k:02}"))) {
             let image = read_grey(&folder.join(format!("{name}.jpg"))).unwrap();
-            for (k, detector) in DETECTORS.into_iter().chain([plain]).enumerate() {
-                if find_chessboard_by(detector, &image, 9, 6).unwrap().is_none() {
-                    lost[k].push(name.clone());
-                }
-            }
             let found = board.find(&image, &target).unwrap().map_or(0, |c| c.len());
             assert!(found >= 50, "{name}: {found} corners");
+            if name.ends_with("01") || name.ends_with("04") || name.ends_with("05") {
+                let mut corners = Vector::<Point2f>::new();
+                let plain = calib3d::find_chessboard_corners_sb_def(&as_mat(&image).unwrap(), Size::new(9, 6), &mut corners).unwrap();
+                missed.extend((!plain).then_some(name));
+            }
         }
-        DETECTORS.into_iter().chain([plain]).zip(&lost).for_each(|(d, lost)| println!("{d:?} misses {lost:?}"));
-        assert!(!lost[0].is_empty() || !lost[3].is_empty(), "one detector would do");
+        // Without oversampling the detector loses three of the thirteen pairs.
+        assert_eq!(missed, ["left04", "left05", "right01", "right04"]);
     }
 
     #[test]
@@ -427,7 +425,12 @@ mod tests {
             let nearest = |p: &Point2<f64>| expected.iter().map(|e| (p - e).norm()).fold(f64::INFINITY, f64::min);
             let mut errors: Vec<f64> = found.iter().map(|(_, p)| nearest(p)).collect();
             errors.sort_by(f64::total_cmp);
-            println!("{name} {columns}x{rows}: {} corners, median {:.3} px, largest {:.3} px", found.len(), errors[errors.len() / 2], errors[errors.len() - 1]);
+            println!(
+                "{name} {columns}x{rows}: {} corners, median {:.3} px, largest {:.3} px",
+                found.len(),
+                errors[errors.len() / 2],
+                errors[errors.len() - 1]
+            );
         }
         for k in 1..4 {
             let text = std::fs::read_to_string(folder.join(format!("negative_{k}.dat"))).unwrap();

@@ -65,11 +65,7 @@ pub fn refine(image: &GrayImage, start: &Point2<f64>, pixels_per_square: &Matrix
     let variance: f64 = samples.iter().map(|s| (s.1 - mean).powi(2)).sum();
     let pixel = Point2::new(unknowns[0], unknowns[1]);
     let near = (pixel - start).norm() < 0.5 * radius_px;
-    if near && cost < (1.0 - EXPLAINED) * variance {
-        Refined::Fitted(Corner { pixel, contrast: unknowns[6] })
-    } else {
-        Refined::NoCorner
-    }
+    if near && cost < (1.0 - EXPLAINED) * variance { Refined::Fitted(Corner { pixel, contrast: unknowns[6] }) } else { Refined::NoCorner }
 }
 
 /// Corner x and y, angles of the edges along a row and down the rows, softness s, m, a.
@@ -78,13 +74,15 @@ type Unknowns = SVector<f64, 7>;
 type Sample = (Vector2<f64>, f64);
 
 fn window(image: &GrayImage, unknowns: &Unknowns, radius_px: f64, margin_px: f64) -> Vec<Sample> {
-    let centre = Vector2::new(unknowns[0], unknowns[1]);
-    let range = |at: f64, size: u32| (at - radius_px).ceil().max(0.0) as u32..((at + radius_px).floor() + 1.0).clamp(0.0, f64::from(size)) as u32;
+    let edges = Edges::new(unknowns);
+    let centre = edges.corner;
+    let range =
+        |at: f64, size: u32| (at - radius_px).ceil().max(0.0) as u32..((at + radius_px).floor() + 1.0).clamp(0.0, f64::from(size)) as u32;
     let mut samples = Vec::new();
     for y in range(centre.y, image.height()) {
         for x in range(centre.x, image.width()) {
             let place = Vector2::new(f64::from(x), f64::from(y));
-            let [dx, dy] = distances(unknowns, &(place - centre));
+            let [dx, dy] = edges.distances(&(place - centre));
             if (place - centre).norm() <= radius_px && dx.abs().min(dy.abs()) <= margin_px {
                 samples.push((place, f64::from(image.get_pixel(x, y)[0])));
             }
@@ -93,34 +91,54 @@ fn window(image: &GrayImage, unknowns: &Unknowns, radius_px: f64, margin_px: f64
     samples
 }
 
-/// Signed distances from the edge down the rows and from the edge along a row.
-fn distances(unknowns: &Unknowns, from_corner: &Vector2<f64>) -> [f64; 2] {
-    let ((sx, cx), (sy, cy)) = (unknowns[2].sin_cos(), unknowns[3].sin_cos());
-    [sy * from_corner.x - cy * from_corner.y, cx * from_corner.y - sx * from_corner.x]
+/// The edges of (1).
+struct Edges {
+    corner: Vector2<f64>,
+    /// Directions of the edge along a row and of that down the rows.
+    along: [Vector2<f64>; 2],
+    softness: f64,
 }
 
-/// Value of (1) less m, over a; and its derivatives by the corner, the angles and the softness.
-fn shape(unknowns: &Unknowns, place: &Vector2<f64>) -> (f64, SVector<f64, 5>) {
-    let q = place - Vector2::new(unknowns[0], unknowns[1]);
-    let [dx, dy] = distances(unknowns, &q);
-    let s = unknowns[4];
-    let (tx, ty) = ((dx / s).tanh(), (dy / s).tanh());
-    let (by_dx, by_dy) = ((1.0 - tx * tx) / s * ty, (1.0 - ty * ty) / s * tx);
-    let ((sx, cx), (sy, cy)) = (unknowns[2].sin_cos(), unknowns[3].sin_cos());
-    let derivatives = [
-        -by_dx * sy + by_dy * sx,
-        by_dx * cy - by_dy * cx,
-        by_dy * (-sx * q.y - cx * q.x),
-        by_dx * (cy * q.x + sy * q.y),
-        -(by_dx * dx + by_dy * dy) / s,
-    ];
-    (tx * ty, derivatives.into())
+impl Edges {
+    fn new(unknowns: &Unknowns) -> Edges {
+        let along = [unknowns[2], unknowns[3]].map(|angle| Vector2::new(angle.cos(), angle.sin()));
+        Edges { corner: Vector2::new(unknowns[0], unknowns[1]), along, softness: unknowns[4] }
+    }
+
+    /// Signed distances d_x and d_y of a place relative to the corner.
+    fn distances(&self, q: &Vector2<f64>) -> [f64; 2] {
+        [-self.along[1].perp(q), self.along[0].perp(q)]
+    }
+
+    /// Value of (1) less m, over a.
+    fn value(&self, place: &Vector2<f64>) -> f64 {
+        let [dx, dy] = self.distances(&(place - self.corner));
+        (dx / self.softness).tanh() * (dy / self.softness).tanh()
+    }
+
+    /// The same with its derivatives by the corner, the angles and the softness.
+    fn value_and_slopes(&self, place: &Vector2<f64>) -> (f64, [f64; 5]) {
+        let q = place - self.corner;
+        let [dx, dy] = self.distances(&q);
+        let (tx, ty) = ((dx / self.softness).tanh(), (dy / self.softness).tanh());
+        let (by_dx, by_dy) = ((1.0 - tx * tx) / self.softness * ty, (1.0 - ty * ty) / self.softness * tx);
+        let [x, y] = &self.along;
+        let slopes = [
+            by_dy * x.y - by_dx * y.y,
+            by_dx * y.x - by_dy * x.x,
+            -by_dy * x.dot(&q),
+            by_dx * y.dot(&q),
+            -(by_dx * dx + by_dy * dy) / self.softness,
+        ];
+        (tx * ty, slopes)
+    }
 }
 
 /// The best m and a for the place given.
 fn set_levels(unknowns: &mut Unknowns, samples: &[Sample]) {
     let n = samples.len() as f64;
-    let shapes: Vec<f64> = samples.iter().map(|(place, _)| shape(unknowns, place).0).collect();
+    let edges = Edges::new(unknowns);
+    let shapes: Vec<f64> = samples.iter().map(|(place, _)| edges.value(place)).collect();
     let (mean_t, mean_i) = (shapes.iter().sum::<f64>() / n, samples.iter().map(|s| s.1).sum::<f64>() / n);
     let covariance: f64 = shapes.iter().zip(samples).map(|(t, s)| (t - mean_t) * (s.1 - mean_i)).sum();
     let variance: f64 = shapes.iter().map(|t| (t - mean_t).powi(2)).sum();
@@ -129,7 +147,8 @@ fn set_levels(unknowns: &mut Unknowns, samples: &[Sample]) {
 }
 
 fn squares(unknowns: &Unknowns, samples: &[Sample]) -> f64 {
-    samples.iter().map(|(place, grey)| (unknowns[5] + unknowns[6] * shape(unknowns, place).0 - grey).powi(2)).sum()
+    let edges = Edges::new(unknowns);
+    samples.iter().map(|(place, grey)| (unknowns[5] + unknowns[6] * edges.value(place) - grey).powi(2)).sum()
 }
 
 /// Levenberg-Marquardt on all seven; the sum of squares at the end.
@@ -139,10 +158,11 @@ fn adjust(unknowns: &mut Unknowns, samples: &[Sample], radius_px: f64) -> f64 {
     for _ in 0..ITERATIONS {
         let mut normal = SMatrix::<f64, 7, 7>::zeros();
         let mut gradient = Unknowns::zeros();
+        let (edges, a) = (Edges::new(unknowns), unknowns[6]);
         for (place, grey) in samples {
-            let (value, by_shape) = shape(unknowns, place);
-            let a = unknowns[6];
-            let row = Unknowns::from([a * by_shape[0], a * by_shape[1], a * by_shape[2], a * by_shape[3], a * by_shape[4], 1.0, value]);
+            let (value, slopes) = edges.value_and_slopes(place);
+            let [x, y, along_x, along_y, softness] = slopes.map(|slope| a * slope);
+            let row = Unknowns::from([x, y, along_x, along_y, softness, 1.0, value]);
             normal += row * row.transpose();
             gradient += row * (unknowns[5] + a * value - grey);
         }
@@ -174,12 +194,12 @@ mod tests {
 
     /// Two edges through `corner`, the area of each pixel sampled 16 by 16 times, and what is printed `margin` px off them.
     fn drawn(corner: Point2<f64>, angles: [f64; 2], print_px: f64) -> GrayImage {
-        let unknowns = Unknowns::from([corner.x, corner.y, angles[0], angles[1], 1.0, 0.0, 0.0]);
+        let edges = Edges::new(&Unknowns::from([corner.x, corner.y, angles[0], angles[1], 1.0, 0.0, 0.0]));
         GrayImage::from_fn(60, 50, |x, y| {
             let mut sum = 0.0;
             for k in 0..256 {
                 let offset = Vector2::new(f64::from(k % 16), f64::from(k / 16)) / 16.0 - Vector2::repeat(0.5 - 1.0 / 32.0);
-                let [dx, dy] = distances(&unknowns, &(Vector2::new(f64::from(x), f64::from(y)) + offset - corner.coords));
+                let [dx, dy] = edges.distances(&(Vector2::new(f64::from(x), f64::from(y)) + offset - corner.coords));
                 let bright = dx * dy > 0.0 && dx.abs().min(dy.abs()) < print_px;
                 sum += if bright { 200.0 } else { 40.0 };
             }
@@ -197,8 +217,24 @@ mod tests {
             assert!((found.pixel - Point2::from(corner)).norm() < 0.015, "{} {corner:?}", found.pixel);
             assert!((found.contrast - 80.0).abs() < 4.0);
             // One row further the colours are exchanged.
-            let exchanged = refine(&image, &start, &Matrix2::from_columns(&[to_next.column(0).into_owned(), -to_next.column(1)]), f64::INFINITY);
+            let exchanged =
+                refine(&image, &start, &Matrix2::from_columns(&[to_next.column(0).into_owned(), -to_next.column(1)]), f64::INFINITY);
             assert!(matches!(exchanged, Refined::Fitted(c) if (c.contrast + 80.0).abs() < 4.0));
+        }
+    }
+
+    #[test]
+    fn slopes_meet_central_differences() {
+        let unknowns = Unknowns::from([30.3, 24.8, 0.3, 1.8, 0.9, 0.0, 0.0]);
+        for place in [Vector2::new(31.0, 25.0), Vector2::new(29.0, 26.0), Vector2::new(30.0, 22.0)] {
+            let slopes = Edges::new(&unknowns).value_and_slopes(&place).1;
+            for (k, slope) in slopes.into_iter().enumerate() {
+                let mut moved = [unknowns, unknowns];
+                moved[0][k] += 1e-6;
+                moved[1][k] -= 1e-6;
+                let [ahead, behind] = moved.map(|u| Edges::new(&u).value(&place));
+                assert!(((ahead - behind) / 2e-6 - slope).abs() < 1e-7, "{k}: {slope}");
+            }
         }
     }
 

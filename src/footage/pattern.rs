@@ -33,8 +33,7 @@ impl Board {
             }
             Board::Charuco(board) => {
                 let marked = board.marked_squares()?;
-                let mut all: Vec<Rectangle> =
-                    (0..across * down).filter(|k| !marked.iter().any(|(at, _)| at == k)).map(square).collect();
+                let mut all: Vec<Rectangle> = (0..across * down).filter(|k| !marked.iter().any(|(at, _)| at == k)).map(square).collect();
                 for (at, id) in marked {
                     let [left, top, ..] = square(at);
                     all.extend(board.marker(id, left, top)?);
@@ -148,7 +147,8 @@ mod tests {
                 for (id, pixel) in &found {
                     let expected = target.points[*id] / board.square_m() * 40.0 + nalgebra::Vector2::repeat(origin - 0.5);
                     let symmetric = matches!(board, Board::Chessboard { columns: 8, .. });
-                    let other = target.points[target.points.len() - 1 - id] / board.square_m() * 40.0 + nalgebra::Vector2::repeat(origin - 0.5);
+                    let other =
+                        target.points[target.points.len() - 1 - id] / board.square_m() * 40.0 + nalgebra::Vector2::repeat(origin - 0.5);
                     let error = (pixel.coords - expected).norm();
                     assert!(error < 0.02 || symmetric && (pixel.coords - other).norm() < 0.02, "{board}: {id} {pixel} {expected}");
                 }

@@ -19,10 +19,8 @@ pub fn homography(from: &[Vector2<f64>], to: &[Vector2<f64>]) -> Option<Matrix3<
     let mut normal = SMatrix::<f64, 9, 9>::zeros();
     for (a, b) in from.iter().zip(to) {
         let (p, q) = (scaled_from * a.push(1.0), scaled_to * b.push(1.0));
-        let rows = [
-            [p.x, p.y, 1.0, 0.0, 0.0, 0.0, -q.x * p.x, -q.x * p.y, -q.x],
-            [0.0, 0.0, 0.0, p.x, p.y, 1.0, -q.y * p.x, -q.y * p.y, -q.y],
-        ];
+        let rows =
+            [[p.x, p.y, 1.0, 0.0, 0.0, 0.0, -q.x * p.x, -q.x * p.y, -q.x], [0.0, 0.0, 0.0, p.x, p.y, 1.0, -q.y * p.x, -q.y * p.y, -q.y]];
         for row in rows {
             let row = SVector::<f64, 9>::from(row);
             normal += row * row.transpose();
@@ -91,7 +89,9 @@ mod tests {
     #[test]
     fn exact_projections_give_the_pose_back() {
         let board = grid(5, 4, 0.04);
-        for (turn, place) in [([0.2, -0.3, 2.9], [0.1, -0.2, 1.4]), ([0.0, 0.0, 0.0], [0.0, 0.0, 0.6]), ([-0.7, 0.5, -1.2], [0.4, 0.3, 2.0])] {
+        for (turn, place) in
+            [([0.2, -0.3, 2.9], [0.1, -0.2, 1.4]), ([0.0, 0.0, 0.0], [0.0, 0.0, 0.6]), ([-0.7, 0.5, -1.2], [0.4, 0.3, 2.0])]
+        {
             let pose = Isometry3::new(Vector3::from(place), Vector3::from(turn));
             let ideal: Vec<_> = board
                 .iter()

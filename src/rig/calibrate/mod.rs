@@ -130,13 +130,7 @@ pub fn calibrate(
 }
 
 /// One camera from its own views: a start for the joint adjustment.
-fn alone(
-    name: &str,
-    size_px: [u32; 2],
-    target: &Target,
-    own: &[&Detection],
-    options: &CalibrateOptions,
-) -> Result<Camera, CalibrateError> {
+fn alone(name: &str, size_px: [u32; 2], target: &Target, own: &[&Detection], options: &CalibrateOptions) -> Result<Camera, CalibrateError> {
     if own.len() < FEWEST_VIEWS {
         return Err(CalibrateError::TooFewViews { camera: name.into(), views: own.len() });
     }
@@ -261,13 +255,7 @@ impl<'a> Work<'a> {
         chosen
     }
 
-    fn problem(
-        &self,
-        cameras: &[Camera],
-        boards: &Boards,
-        chosen: &Chosen,
-        huber_px: f64,
-    ) -> (Bundle<'a>, Solution) {
+    fn problem(&self, cameras: &[Camera], boards: &Boards, chosen: &Chosen, huber_px: f64) -> (Bundle<'a>, Solution) {
         let views = chosen.values().map(|seen| seen.iter().map(|(_, s)| s.clone()).collect()).collect();
         let boards = chosen.keys().map(|view| boards[view]).collect();
         (Bundle { target: self.target, views, layout: self.layout.clone(), huber_px }, Solution { cameras: cameras.to_vec(), boards })

@@ -195,7 +195,8 @@ impl Calibration {
         let rig_from_board = self.boards.get(&view)?;
         let heights = self.rig.cameras.iter().map(|c| rig_from_board.inverse_transform_point(&c.centre().into()).z);
         let below = heights.sum::<f64>() < 0.0;
-        let half_turn = if below { UnitQuaternion::from_scaled_axis(Vector3::x() * std::f64::consts::PI) } else { UnitQuaternion::identity() };
+        let half_turn =
+            if below { UnitQuaternion::from_scaled_axis(Vector3::x() * std::f64::consts::PI) } else { UnitQuaternion::identity() };
         let rig_from_world = rig_from_board * Isometry3::from_parts(Vector3::zeros().into(), half_turn);
         let mut rig = self.rig.clone();
         for camera in &mut rig.cameras {

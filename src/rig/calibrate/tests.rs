@@ -132,7 +132,11 @@ fn numeric_column(bundle: &Bundle, solution: &Solution, k: usize) -> DVector<f64
     let shareds = bundle.layout.offset(last) + bundle.layout.width(last);
     let moved = |h: f64| {
         let (mut y, mut z) = (DVector::zeros(locals), DVector::zeros(shareds));
-        if k < locals { y[k] = h } else { z[k - locals] = h }
+        if k < locals {
+            y[k] = h
+        } else {
+            z[k - locals] = h
+        }
         residuals(bundle, &bundle.retract(solution, &y, &z))
     };
     // Pixels are linear in the intrinsics.
@@ -170,7 +174,8 @@ fn exact_corners_give_the_cameras_back() {
 /// Detections of one camera as OpenCV takes them.
 fn for_opencv(detections: &[Detection], target: &Target, camera: usize) -> (CvVector<CvVector<Point3f>>, CvVector<CvVector<Point2f>>) {
     let own = || detections.iter().filter(move |d| d.camera == camera);
-    let object = |d: &Detection| d.corners.iter().map(|(id, _)| target.point(*id)).map(|p| Point3f::new(p.x as f32, p.y as f32, 0.0)).collect();
+    let object =
+        |d: &Detection| d.corners.iter().map(|(id, _)| target.point(*id)).map(|p| Point3f::new(p.x as f32, p.y as f32, 0.0)).collect();
     let image = |d: &Detection| d.corners.iter().map(|(_, p)| Point2f::new(p.x as f32, p.y as f32)).collect();
     (own().map(object).collect(), own().map(image).collect())
 }
@@ -191,8 +196,7 @@ fn one_camera_alone_is_calibrated_as_by_opencv() {
     let criteria = TermCriteria::new(3, 200, 1e-12).unwrap();
     let size = Size::new(640, 480);
     let flags = calib3d::CALIB_FIX_K3;
-    let rms =
-        calib3d::calibrate_camera(&objects, &images, size, &mut matrix, &mut lens, &mut turns, &mut places, flags, criteria).unwrap();
+    let rms = calib3d::calibrate_camera(&objects, &images, size, &mut matrix, &mut lens, &mut turns, &mut places, flags, criteria).unwrap();
     assert!((ours.rms_px - rms).abs() < 1e-6 * rms, "{} px, OpenCV {rms} px", ours.rms_px);
     let camera = &ours.rig.cameras[0];
     for (r, c) in [(0, 0), (1, 1), (0, 2), (1, 2)] {
@@ -307,7 +311,10 @@ fn views_that_cannot_calibrate_are_refused_with_the_remedy() {
     let boards = true_boards(12, &mut rng);
     // All parallel to one plane: the board slides over a tilted table.
     let table = UnitQuaternion::from_scaled_axis(Vector3::new(0.5, 0.2, 0.0));
-    let sliding: Vec<_> = boards.iter().map(|b| Isometry3::from_parts(b.translation, table * UnitQuaternion::from_scaled_axis(Vector3::z() * 0.3 * b.translation.z))).collect();
+    let sliding: Vec<_> = boards
+        .iter()
+        .map(|b| Isometry3::from_parts(b.translation, table * UnitQuaternion::from_scaled_axis(Vector3::z() * 0.3 * b.translation.z)))
+        .collect();
     for parallel in [&sliding, &vec![boards[0]; 12]] {
         let error = calibrate(&names, &target, &seen(&cameras, parallel, &target, 0.2, &mut rng), &PLAIN).unwrap_err();
         assert!(matches!(error, CalibrateError::Unobserved { .. } | CalibrateError::Singular { .. }), "{error}");
