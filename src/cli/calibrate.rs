@@ -5,12 +5,12 @@ use super::{interrupt, progress};
 use anyhow::{Context, Result, bail, ensure};
 use image::GrayImage;
 use muybridge::footage::board::{Board, BoardError};
-use muybridge::io::calib_toml::write_rig;
+use muybridge::io::calib_toml::{read_rig, write_rig};
 use muybridge::io::calib_views::{self, CameraViews};
 use muybridge::io::calibration_json::{self, Source};
 use muybridge::report;
 use muybridge::rig::Rig;
-use muybridge::rig::calibrate::{CalibrateOptions, Calibration, Detection, LensKind, Target, calibrate};
+use muybridge::rig::calibrate::{CalibrateOptions, Calibration, Detection, LensKind, Target, Uncalibrated, calibrate};
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
@@ -20,6 +20,11 @@ const AT_ONCE: usize = 32;
 const TRIED_PICTURES: usize = 4;
 /// Below this part of the picture, distortion at the edges is extrapolated.
 const POOR_COVERAGE: f64 = 0.4;
+
+/// Principal points of real cameras are nearer to the centre than this part of the longer side.
+const FAR_OFF_CENTRE: f64 = 0.1;
+/// Lines about single detections.
+const MOST_LINES: usize = 20;
 
 #[derive(clap::Args)]
 pub struct CalibrateArgs {
@@ -43,6 +48,9 @@ pub struct CalibrateArgs {
     /// Square pixels: one focal length for both directions
     #[arg(long)]
     fix_aspect: bool,
+    /// Keep the camera matrices and lenses of this rig file, by the cameras' names; only poses are found
+    #[arg(long, value_name = "RIG", conflicts_with_all = ["k3", "fix_aspect"])]
+    intrinsics: Option<PathBuf>,
     /// The ChArUco board is white where others are black; without it both are tried
     #[arg(long, requires = "charuco")]
     inverted: bool,
@@ -66,17 +74,33 @@ pub fn run(args: &CalibrateArgs) -> Result<()> {
     let looks =
         cameras.iter().enumerate().map(|(k, camera)| look(&board, &target, camera, k, every, &bar)).collect::<Result<Vec<Look>>>()?;
     bar.finish();
-    let named: Vec<_> = cameras.iter().zip(&looks).map(|(camera, look)| (camera.name.clone(), look.size_px)).collect();
+    let uncalibrated = uncalibrated(&cameras, &looks, args.intrinsics.as_deref())?;
     let detections: Vec<Detection> = looks.iter().flat_map(|look| look.detections.clone()).collect();
     let lens = if matches!(args.lens, Lens::Fisheye) { LensKind::Fisheye } else { LensKind::Brown };
     let options = CalibrateOptions { lens, k3: args.k3, fix_aspect: args.fix_aspect };
-    let result = calibrate(&named, &target, &detections, &options)?;
+    let result = calibrate(&uncalibrated, &target, &detections, &options)?;
     let (rig, world) = world(&result, args.floor_view, &detections)?;
     print(&board, &looks, &result);
     write(&args.output, &rig, &result, &board, &world, &looks)?;
     warnings(&result, &world, args.floor_view.is_none()).iter().for_each(|warning| println!("warning: {warning}"));
     println!("written: {}, {}, {}", args.output.display(), beside(&args.output, "png").display(), beside(&args.output, "json").display());
     Ok(())
+}
+
+fn uncalibrated(cameras: &[CameraViews], looks: &[Look], intrinsics: Option<&Path>) -> Result<Vec<Uncalibrated>> {
+    let rig = intrinsics.map(|path| anyhow::Ok((path, read_rig(path)?))).transpose()?;
+    let one = |(camera, look): (&CameraViews, &Look)| {
+        let (name, size_px) = (camera.name.clone(), look.size_px);
+        let Some((path, rig)) = &rig else { return Ok(Uncalibrated { name, size_px, known: None }) };
+        let known = rig.cameras.iter().find(|c| c.name == name).with_context(|| {
+            let names = rig.cameras.iter().map(|c| c.name.as_str()).collect::<Vec<_>>().join(", ");
+            format!("{}: has no camera {name}, only {names}; rename its tables or the footage", path.display())
+        })?;
+        let ([width, height], [w, h]) = (size_px, known.size_px);
+        ensure!(known.size_px == size_px, "{}: {name} is for pictures of {w}x{h} px, these have {width}x{height}", path.display());
+        Ok(Uncalibrated { name, size_px, known: Some((known.matrix, known.lens)) })
+    };
+    cameras.iter().zip(looks).map(one).collect()
 }
 
 /// What was seen of the board in one camera's footage.
@@ -184,8 +208,11 @@ fn print(board: &Board, looks: &[Look], result: &Calibration) {
     for (look, camera) in looks.iter().zip(&result.rig.cameras).filter(|(look, _)| !look.without.is_empty()) {
         println!("{}: no board in {}", camera.name, numbers(&look.without));
     }
-    for rejected in &result.rejected {
+    for rejected in result.rejected.iter().take(MOST_LINES) {
         println!("put aside: {} in view {}: {}", result.rig.cameras[rejected.camera].name, rejected.view, rejected.reason);
+    }
+    if result.rejected.len() > MOST_LINES {
+        println!("put aside: {} more, all in the JSON file", result.rejected.len() - MOST_LINES);
     }
 }
 
@@ -211,6 +238,16 @@ fn warnings(result: &Calibration, world: &str, no_floor: bool) -> Vec<String> {
             "{}: the boards cover {percent:.0} % of the picture; the lens is guessed elsewhere, so hold the board near the edges and corners too",
             camera.name
         ));
+    }
+    for camera in &result.rig.cameras {
+        let [width, height] = camera.size_px.map(f64::from);
+        let off_px = (camera.matrix[(0, 2)] - 0.5 * width).hypot(camera.matrix[(1, 2)] - 0.5 * height);
+        if off_px > FAR_OFF_CENTRE * width.max(height) {
+            warnings.push(format!(
+                "{}: the principal point lies {off_px:.0} px from the picture's centre, which lenses hardly have; film more views at more angles, or give --intrinsics",
+                camera.name
+            ));
+        }
     }
     warnings
 }

@@ -12,9 +12,10 @@ use crate::io::write_atomic;
 
 /// Resolution aimed at; squares are whole pixels, so the file says the exact one.
 const DOTS_PER_M: f64 = 300.0 / 0.0254;
-/// White around the squares, metres; detectors want half a square, printers leave 5 mm.
-const LEAST_MARGIN_M: f64 = 0.012;
+/// White around the squares: detectors want half a square, printers leave 5 mm, the caption needs its room, and the boards
+/// of `calib/` fit on A4.
 const MARGIN_SQUARES: f64 = 0.6;
+const MARGIN_M: [f64; 2] = [0.012, 0.016];
 const CAPITAL_M: f64 = 0.0025;
 
 /// A board on its sheet.
@@ -24,7 +25,7 @@ pub struct Sheet {
 }
 
 fn margin_m(board: &Board) -> f64 {
-    (MARGIN_SQUARES * board.square_m()).max(LEAST_MARGIN_M)
+    (MARGIN_SQUARES * board.square_m()).clamp(MARGIN_M[0], MARGIN_M[1])
 }
 
 fn caption(board: &Board) -> String {

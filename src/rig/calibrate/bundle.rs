@@ -26,9 +26,10 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Free lens terms by index; `one_focal`: f_x and f_y move together.
-    pub fn new(lens_terms: &[usize], one_focal: bool) -> Layout {
+    /// Free lens terms by index; `one_focal`: f_x and f_y move together. `None`: all intrinsics are known.
+    pub fn new(lens_terms: Option<&[usize]>, one_focal: bool) -> Layout {
         let mut unknown = [None; INTRINSICS];
+        let Some(lens_terms) = lens_terms else { return Layout { unknown, count: 0 } };
         let focal = [0, usize::from(!one_focal)];
         let centre = focal[1] + 1;
         unknown[..4].copy_from_slice(&[Some(focal[0]), Some(focal[1]), Some(centre), Some(centre + 1)]);

@@ -20,11 +20,11 @@ mod tests;
 pub use result::{Calibration, CameraQuality, FittedCorner, FittedSighting, Parameter, Reason, Rejected};
 pub use target::{Detection, Target, Turn};
 
-use super::{Camera, RigError};
+use super::{Camera, Lens, RigError};
 use crate::math::arrow::{LmOptions, minimise};
 use crate::math::order::quantile;
 use bundle::{Bundle, Layout, Sighting, Solution};
-use nalgebra::{Isometry3, Point2};
+use nalgebra::{Isometry3, Matrix3, Point2};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Fewer corners say too little about the lens for the trouble that a wrong one makes.
@@ -38,6 +38,8 @@ const CORNER_SIGMAS: f64 = 5.0;
 const DETECTION_SIGMAS: f64 = 4.0;
 /// Detectors are never better than this, so exact (drawn) corners are not judged by rounding, px.
 const LEAST_SIGMA_PX: f64 = 0.01;
+/// Errors below this are no mistakes, whatever the scale: far boards are less sharp than near ones, px.
+const HARMLESS_PX: f64 = 0.3;
 /// Wrong labels are at least a square off; the limit of the first round, in squares.
 const FIRST_LIMIT_SQUARES: f64 = 0.4;
 const ROUNDS: usize = 8;
@@ -74,10 +76,15 @@ impl CalibrateOptions {
             (LensKind::Fisheye, true) => &[0, 1, 2, 3],
         }
     }
+}
 
-    fn layout(&self) -> Layout {
-        Layout::new(self.lens_terms(), self.fix_aspect)
-    }
+/// A camera before its calibration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Uncalibrated {
+    pub name: String,
+    pub size_px: [u32; 2],
+    /// Camera matrix and lens where they are known; they are kept as they are.
+    pub known: Option<(Matrix3<f64>, Lens)>,
 }
 
 /// Why there is no rig; messages name the camera and the remedy.
@@ -105,9 +112,10 @@ pub enum CalibrateError {
     Impossible(#[from] RigError),
 }
 
-/// Calibrates cameras, given by name and picture size, from detections of `target`. The rig's frame is camera 0's.
+/// Calibrates cameras from detections of `target`; intrinsics are kept where all cameras' are known, else all are found. The
+/// rig's frame is camera 0's.
 pub fn calibrate(
-    cameras: &[(String, [u32; 2])],
+    cameras: &[Uncalibrated],
     target: &Target,
     detections: &[Detection],
     options: &CalibrateOptions,
@@ -116,13 +124,15 @@ pub fn calibrate(
         return Err(CalibrateError::NoCameras);
     }
     let usable: Vec<&Detection> = detections.iter().filter(|d| d.corners.len() >= FEWEST_CORNERS).collect();
+    let known = cameras.iter().all(|c| c.known.is_some());
+    let layout = if known { Layout::new(None, false) } else { Layout::new(Some(options.lens_terms()), options.fix_aspect) };
     let mut placed = Vec::new();
-    for (k, (name, size_px)) in cameras.iter().enumerate() {
+    for (k, camera) in cameras.iter().enumerate() {
         let own: Vec<&Detection> = usable.iter().filter(|d| d.camera == k).copied().collect();
-        placed.push(alone(name, *size_px, target, &own, options)?);
+        placed.push(alone(camera, target, &own, options.lens, &layout)?);
     }
     start::place_cameras(&mut placed, target, &usable)?;
-    let work = Work { target, detections: &usable, layout: options.layout() };
+    let work = Work { target, detections: &usable, layout };
     let settled = work.settle(placed)?;
     let calibration = result::collect(&work, settled, detections)?;
     calibration.rig.validate()?;
@@ -130,15 +140,18 @@ pub fn calibrate(
 }
 
 /// One camera from its own views: a start for the joint adjustment.
-fn alone(name: &str, size_px: [u32; 2], target: &Target, own: &[&Detection], options: &CalibrateOptions) -> Result<Camera, CalibrateError> {
+fn alone(camera: &Uncalibrated, target: &Target, own: &[&Detection], lens: LensKind, layout: &Layout) -> Result<Camera, CalibrateError> {
     if own.len() < FEWEST_VIEWS {
-        return Err(CalibrateError::TooFewViews { camera: name.into(), views: own.len() });
+        return Err(CalibrateError::TooFewViews { camera: camera.name.clone(), views: own.len() });
     }
-    let camera = start::first_camera(name, size_px, options.lens, target, own);
+    let start = start::first_camera(camera, lens, target, own);
+    if layout.count == 0 {
+        return Ok(start);
+    }
     // Alone it is camera 0.
     let own: Vec<Detection> = own.iter().map(|d| Detection { camera: 0, ..(*d).clone() }).collect();
-    let work = Work { target, detections: &own.iter().collect::<Vec<_>>(), layout: options.layout() };
-    let mut cameras = work.settle(vec![camera])?.solution.cameras;
+    let work = Work { target, detections: &own.iter().collect::<Vec<_>>(), layout: layout.clone() };
+    let mut cameras = work.settle(vec![start])?.solution.cameras;
     Ok(cameras.swap_remove(0))
 }
 
@@ -245,7 +258,7 @@ impl<'a> Work<'a> {
             let label = |(id, seen): &(usize, Point2<f64>)| (self.target.turns[turn].relabelled[*id], *seen);
             let fits = |(id, seen): &(usize, Point2<f64>)| {
                 let pixel = bundle::pixel(&cameras[d.camera], board, &self.target.point(*id));
-                pixel.is_some_and(|p| sigma_px.is_none_or(|sigma| (p - seen).norm() <= CORNER_SIGMAS * sigma))
+                pixel.is_some_and(|p| sigma_px.is_none_or(|sigma| (p - seen).norm() <= (CORNER_SIGMAS * sigma).max(HARMLESS_PX)))
             };
             let corners: Vec<_> = d.corners.iter().map(label).filter(fits).collect();
             if corners.len() >= FEWEST_CORNERS {
@@ -316,5 +329,5 @@ impl<'a> Work<'a> {
 
 /// Median distance of its corners up to which a detection may be right.
 fn limit_px(detection: &Detection, sigma_px: Option<f64>) -> f64 {
-    sigma_px.map_or(FIRST_LIMIT_SQUARES * detection.spacing_px(), |sigma| DETECTION_SIGMAS * sigma)
+    sigma_px.map_or(FIRST_LIMIT_SQUARES * detection.spacing_px(), |sigma| (DETECTION_SIGMAS * sigma).max(HARMLESS_PX))
 }

@@ -85,7 +85,7 @@ pub enum Reason {
     #[error("its corners lie on a line")]
     NoPose,
     #[error(
-        "its corners are {median_px:.2} px off where the other views and cameras put the board, more than {limit_px:.2} px: wrong labels, motion blur or cameras out of step"
+        "its corners are {median_px:.2} px off where the other cameras and views put them, above {limit_px:.2} px (wrong labels, blur, cameras out of step)"
     )]
     Disagrees { median_px: f64, limit_px: f64 },
 }

@@ -11,7 +11,7 @@
 use super::bundle::{camera_pose, set_pose};
 use super::homography::board_pose;
 use super::target::{Detection, Target};
-use super::{CalibrateError, LensKind};
+use super::{CalibrateError, LensKind, Uncalibrated};
 use crate::rig::{Camera, Lens};
 use nalgebra::{Isometry3, Matrix3, Rotation3, Vector3};
 use rayon::prelude::*;
@@ -29,29 +29,32 @@ const AGREEMENT: f64 = 0.12;
 /// Proposals per pair of cameras; the vote is quadratic in them.
 const MOST_PROPOSALS: usize = 300;
 
-/// A camera with the focal length that suits its detections best, in the origin of the rig.
-pub fn first_camera(name: &str, size_px: [u32; 2], lens: LensKind, target: &Target, detections: &[&Detection]) -> Camera {
+/// A camera with known intrinsics, or with the focal length that suits its detections best; in the origin of the rig.
+pub fn first_camera(camera: &Uncalibrated, lens: LensKind, target: &Target, detections: &[&Detection]) -> Camera {
+    let longer_px = f64::from(camera.size_px[0].max(camera.size_px[1]));
+    let start = ideal_camera(camera, longer_px, lens);
+    if let Some((matrix, lens)) = camera.known {
+        return Camera { matrix, lens, ..start };
+    }
     let step = detections.len().div_ceil(SEARCHED_DETECTIONS).max(1);
     let chosen: Vec<_> = detections.iter().step_by(step).copied().collect();
     let ratio = LONGEST_FOCAL_WIDTHS / SHORTEST_FOCAL_WIDTHS;
     let candidate = |k: usize| {
         let widths = SHORTEST_FOCAL_WIDTHS * ratio.powf(k as f64 / (FOCAL_STEPS - 1) as f64);
-        let focal_px = widths * f64::from(size_px[0].max(size_px[1]));
-        let camera = ideal_camera(name, size_px, focal_px, lens);
+        let camera = ideal_camera(camera, widths * longer_px, lens);
         let misfit = |d: &&Detection| pose(&camera, target, d).map_or(1e6, |pose| misfit_px(&camera, target, d, &pose).min(1e6));
         let total: f64 = chosen.iter().map(misfit).sum();
         (total, camera)
     };
     let candidates: Vec<(f64, Camera)> = (0..FOCAL_STEPS).into_par_iter().map(candidate).collect();
-    let best = candidates.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
-    best.map_or_else(|| ideal_camera(name, size_px, f64::from(size_px[0]), lens), |(_, camera)| camera)
+    candidates.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).map_or(start, |(_, best)| best)
 }
 
-fn ideal_camera(name: &str, size_px: [u32; 2], focal_px: f64, lens: LensKind) -> Camera {
-    let [cx, cy] = size_px.map(|s| 0.5 * f64::from(s) - 0.5);
+fn ideal_camera(camera: &Uncalibrated, focal_px: f64, lens: LensKind) -> Camera {
+    let [cx, cy] = camera.size_px.map(|s| 0.5 * f64::from(s) - 0.5);
     Camera {
-        name: name.into(),
-        size_px,
+        name: camera.name.clone(),
+        size_px: camera.size_px,
         matrix: Matrix3::new(focal_px, 0.0, cx, 0.0, focal_px, cy, 0.0, 0.0, 1.0),
         lens: if lens == LensKind::Fisheye { Lens::Fisheye([0.0; 4]) } else { Lens::IDEAL },
         camera_from_world: Rotation3::identity(),

@@ -65,8 +65,8 @@ fn seen(cameras: &[Camera], boards: &[Isometry3<f64>], target: &Target, sigma_px
     detections
 }
 
-fn named(cameras: &[Camera]) -> Vec<(String, [u32; 2])> {
-    cameras.iter().map(|c| (c.name.clone(), c.size_px)).collect()
+fn named(cameras: &[Camera]) -> Vec<Uncalibrated> {
+    cameras.iter().map(|c| Uncalibrated { name: c.name.clone(), size_px: c.size_px, known: None }).collect()
 }
 
 fn brown() -> Lens {
@@ -91,7 +91,7 @@ fn jacobians_meet_central_differences() {
                 })
                 .collect();
             // 1 px of Huber's loss: some residuals on each side.
-            let bundle = Bundle { target: &target, views, layout: Layout::new(terms, one_focal), huber_px: 1.0 };
+            let bundle = Bundle { target: &target, views, layout: Layout::new(Some(terms), one_focal), huber_px: 1.0 };
             let equations = (&bundle).linearise(&solution);
             let (locals, shareds) = (equations.local.size(), equations.shared.nrows());
             assert_eq!((locals, shareds), (24, 3 * bundle.layout.count + 12));
@@ -352,4 +352,26 @@ fn chains_of_cameras_hold_together_and_the_floor_is_the_world() {
         let expected = Vector3::new(on_board.x, -on_board.y, -on_board.z);
         assert!((placed.centre() - expected).norm() < 5e-3 && placed.centre().z > 0.2, "{} {expected}", placed.centre());
     }
+}
+
+#[test]
+fn known_intrinsics_are_kept_and_make_few_views_enough() {
+    let mut rng = ChaCha8Rng::seed_from_u64(19);
+    let target = Target::chessboard(9, 6, 0.04);
+    let cameras = true_cameras(brown());
+    // Parallel boards, which could not tell focal lengths.
+    let board = true_boards(1, &mut rng)[0];
+    let boards: Vec<_> = (0..4).map(|k| nalgebra::Translation3::new(0.02 * f64::from(k), 0.0, 0.1) * board).collect();
+    let detections = seen(&cameras, &boards, &target, 0.1, &mut rng);
+    let mut known = named(&cameras);
+    known.iter_mut().zip(&cameras).for_each(|(k, c)| k.known = Some((c.matrix, c.lens)));
+    let found = calibrate(&known, &target, &detections, &PLAIN).unwrap();
+    for (a, b) in found.rig.cameras.iter().zip(&cameras) {
+        assert_eq!((a.matrix, a.lens), (b.matrix, b.lens));
+        assert!((a.centre() - b.centre()).norm() < 2e-3);
+    }
+    assert_eq!(found.parameters.len(), 12);
+    let alone = calibrate(&known[..1], &target, &detections.into_iter().filter(|d| d.camera == 0).collect::<Vec<_>>(), &PLAIN).unwrap();
+    assert!(alone.parameters.is_empty() && alone.boards.len() == 4);
+    assert!((alone.boards[&2].translation.vector - boards[2].translation.vector).norm() < 2e-3);
 }
