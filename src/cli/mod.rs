@@ -1,6 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod board;
 mod calibrate;
+mod bench;
 mod check;
 mod clouds;
 mod demo;
@@ -12,6 +13,7 @@ mod motions;
 mod observe;
 mod progress;
 mod render;
+mod rig;
 mod track;
 mod whole;
 
@@ -42,6 +44,9 @@ enum Command {
     Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
+    /// Rig files: in words and a picture, and from one form to another
+    #[command(subcommand)]
+    Rig(rig::RigCommand),
     /// Motion databases and their PCA models
     #[command(subcommand)]
     Model(model::ModelCommand),
@@ -49,6 +54,9 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
+    /// Accuracy and time beside OpenCV's, against known truth
+    #[command(subcommand)]
+    Bench(bench::BenchCommand),
     /// Phantom footage of a motion file before a rig, with its truth
     Render(render::RenderArgs),
 }
@@ -78,6 +86,8 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),
         Command::Render(args) => render::run(&args),
+        Command::Rig(command) => rig::run(&command),
+        Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
     }

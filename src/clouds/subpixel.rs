@@ -5,8 +5,8 @@
 //! is the right one (a parabola would pull towards whole disparities).
 
 /// Offset δ of equation (1) from the costs just below, at and just above a minimum; `None` at the end of the search range.
-pub fn equiangular([below, at, above]: [u16; 3]) -> Option<f32> {
-    if below == u16::MAX || above == u16::MAX {
+pub fn equiangular([below, at, above]: [u8; 3]) -> Option<f32> {
+    if below == u8::MAX || above == u8::MAX {
         return None;
     }
     let slope = f32::from(below.max(above)) - f32::from(at);

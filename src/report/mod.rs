@@ -18,6 +18,7 @@ pub mod curves;
 pub mod figures;
 pub mod maps;
 pub mod overlay;
+pub mod rig;
 
 pub use calibration::calibration;
 pub use clouds::cloud_and_body;
@@ -25,6 +26,7 @@ pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::depth_map;
 pub use overlay::{overlay, strip};
+pub use rig::rig_views;
 
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {

@@ -66,6 +66,30 @@ impl Camera {
         self.lens.undistort(&Vector2::new((pixel.x - m[(0, 2)] - m[(0, 1)] * y) / m[(0, 0)], y))
     }
 
+    /// Angles between the rays through the middles of opposite edges of the picture, horizontal and vertical, radians; `None`
+    /// where an edge has no ray.
+    pub fn field_of_view(&self) -> [Option<f64>; 2] {
+        let [w, h] = self.size_px.map(f64::from);
+        let (cx, cy) = (self.matrix[(0, 2)], self.matrix[(1, 2)]);
+        let edges = [[Point2::new(-0.5, cy), Point2::new(w - 0.5, cy)], [Point2::new(cx, -0.5), Point2::new(cx, h - 0.5)]];
+        edges.map(|[a, b]| Some(self.ray(&a)?.angle(&self.ray(&b)?)))
+    }
+
+    /// How far the lens moves the picture's corners away from the principal point, pixels: that of the corner moved most,
+    /// negative for a barrel.
+    pub fn corner_shift_px(&self) -> f64 {
+        let m = &self.matrix;
+        let [w, h] = self.size_px.map(|s| f64::from(s) - 1.0);
+        let centre = Point2::new(m[(0, 2)], m[(1, 2)]);
+        let shift = |corner: Point2<f64>| {
+            let y = (corner.y - centre.y) / m[(1, 1)];
+            let ideal = Vector2::new((corner.x - centre.x - m[(0, 1)] * y) / m[(0, 0)], y);
+            (self.distorted_pixel(&ideal) - centre).norm() - (corner - centre).norm()
+        };
+        let corners = [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)].map(|(x, y)| shift(Point2::new(x, y)));
+        corners.into_iter().fold(0.0, |most: f64, s| if s.abs() > most.abs() { s } else { most })
+    }
+
     /// Unit direction in the world of the ray through a pixel; `None` where [`Self::normalise`] has none.
     pub fn ray(&self, pixel: &Point2<f64>) -> Option<Vector3<f64>> {
         let n = self.normalise(pixel)?;
@@ -179,6 +203,24 @@ mod tests {
             assert!(((point - camera.centre()).normalize() - ray).norm() < 1e-12);
             assert!(camera.project(&Vector3::new(0.4, -3.1, 1.2)).is_none());
         }
+    }
+
+    #[test]
+    fn fields_and_corner_shifts_have_their_closed_forms() {
+        let ideal = camera(Lens::IDEAL);
+        let [wide, high] = ideal.field_of_view().map(Option::unwrap);
+        assert!((wide - ((318.5 / 353.5f64).atan() + (321.5 / 353.5f64).atan())).abs() < 1e-12);
+        assert!((high - ((239.7 / 349.0f64).atan() + (240.3 / 349.0f64).atan())).abs() < 1e-12);
+        assert!(ideal.corner_shift_px().abs() < 1e-9);
+        // The farthest corner, at r from the centre with fx = fy, is drawn at f atan(r / f).
+        let mut fisheye = camera(Lens::Fisheye([0.0; 4]));
+        fisheye.matrix[(1, 1)] = 353.5;
+        let r = 321f64.hypot(239.8);
+        assert!((fisheye.corner_shift_px() - (353.5 * (r / 353.5).atan() - r)).abs() < 1e-9);
+        let [wide, _] = fisheye.field_of_view().map(Option::unwrap);
+        assert!((wide - 640.0 / 353.5).abs() < 1e-12);
+        fisheye.matrix[(0, 0)] = 180.0;
+        assert_eq!(fisheye.field_of_view()[0], None);
     }
 
     #[test]
