@@ -156,7 +156,7 @@ fn rendered_boards_give_the_rig_back() {
         let centre = world.transform_point(&camera.centre().into()).coords;
         assert!((found.centre() - centre).norm() < 2e-3 && found.centre().z > 0.3, "{} {centre}", found.centre());
         let (place_mm, turn_deg) = relative_errors(&rig.cameras, &truth, k);
-        assert!(place_mm < 0.3 && turn_deg < 0.05, "{}: {place_mm} mm, {turn_deg} deg", camera.name);
+        assert!(place_mm < 0.6 && turn_deg < 0.1, "{}: {place_mm} mm, {turn_deg} deg", camera.name);
         assert!((found.matrix - camera.matrix).amax() < 1.0, "{}", found.matrix);
     }
     let json: serde_json::Value =
@@ -199,7 +199,7 @@ fn other_ways_of_giving_the_same(folder: &Path) {
     let rig = read_rig(&folder.join("globs.toml")).unwrap();
     assert_eq!((rig.cameras[0].translation, rig.cameras[0].camera_from_world), (Vector3::zeros(), Rotation3::identity()));
     let (place_mm, turn_deg) = relative_errors(&rig.cameras, &true_rig(), 2);
-    assert!(place_mm < 0.4 && turn_deg < 0.05, "{place_mm} mm {turn_deg} deg");
+    assert!(place_mm < 0.6 && turn_deg < 0.1, "{place_mm} mm {turn_deg} deg");
     // Known intrinsics are kept, three views are enough.
     let arguments = ["--every", "4", "--intrinsics", "out/Calib.toml", "-o", "known.toml"];
     let output = run_calibrate(folder, &arguments);
@@ -397,7 +397,7 @@ fn the_rendered_laboratory_is_nearer_to_its_truth_than_by_opencv() {
         println!("0-{k} ours    {:8.3} px {:8.3} px {:6.3} px {:6.3} mm {:7.4} deg", a[0], a[1], a[2], a[3], a[4]);
         println!("0-{k} OpenCV  {:8.3} px {:8.3} px {:6.3} px {:6.3} mm {:7.4} deg", b[0], b[1], b[2], b[3], b[4]);
         assert!(a[0] < b[0] && a[1] < b[1] && a[2] < b[2] && a[3] < b[3].max(0.1) && a[4] < b[4].max(0.02));
-        assert!(a[0] < 0.3 && a[1] < 0.4 && a[2] < 0.3 && a[3] < 0.15 && a[4] < 0.03);
+        assert!(a[0] < 0.3 && a[1] < 0.4 && a[2] < 0.6 && a[3] < 0.15 && a[4] < 0.03);
     }
     for (p, value) in result.parameters.iter().filter(|p| p.name.ends_with("_px")).map(|p| {
         let m = &truth[p.camera].matrix;

@@ -1,7 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
+mod bench;
 mod board;
 mod calibrate;
-mod bench;
 mod check;
 mod clouds;
 mod demo;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use image::{GrayImage, Luma, imageops};
 
-use super::canvas::{Align, Canvas, INK, WHITE};
+use super::canvas::{Align, Canvas, INK, WHITE, text_width_px};
 use super::{ReportError, png_bytes};
 use crate::footage::board::Board;
 use crate::io::write_atomic;
@@ -41,7 +41,10 @@ pub fn sheet(board: &Board) -> Result<Sheet, ReportError> {
     let margin = (margin_m(board) * scale).round() as u32;
     let mut canvas = Canvas::new(pattern.width() + 2 * margin, pattern.height() + 2 * margin, WHITE);
     let below = f64::from(pattern.height() + margin) + 0.65 * f64::from(margin);
-    canvas.text([f64::from(margin), below], &caption(board), CAPITAL_M * scale, INK, Align::Left)?;
+    // Narrow boards have smaller letters.
+    let (text, capital_px) = (caption(board), CAPITAL_M * scale);
+    let fitting_px = capital_px * f64::from(pattern.width()) / text_width_px(&text, capital_px)?;
+    canvas.text([f64::from(margin), below], &text, capital_px.min(fitting_px), INK, Align::Left)?;
     let mut picture = GrayImage::from_fn(canvas.picture.width(), canvas.picture.height(), |x, y| Luma([canvas.picture.get_pixel(x, y)[0]]));
     imageops::replace(&mut picture, &pattern, margin.into(), margin.into());
     Ok(Sheet { picture, pixels_per_m: scale.round() as u32 })
@@ -74,8 +77,12 @@ fn svg(board: &Board) -> Result<String, ReportError> {
         let _ = writeln!(text, "<rect x=\"{x}\" y=\"{y}\" width=\"{}\" height=\"{}\"/>", mm(w), mm(h));
     }
     let (x, y) = (mm(margin), mm(board.size_m()[1] + 1.65 * margin));
-    let _ =
-        writeln!(text, "</g>\n<text x=\"{x}\" y=\"{y}\" font-family=\"sans-serif\" font-size=\"3.5\">{}</text>\n</svg>", caption(board));
+    let text_width = mm(board.size_m()[0]).min(150.0);
+    let _ = writeln!(
+        text,
+        "</g>\n<text x=\"{x}\" y=\"{y}\" font-family=\"sans-serif\" font-size=\"3.5\" textLength=\"{text_width}\" lengthAdjust=\"spacingAndGlyphs\">{}</text>\n</svg>",
+        caption(board)
+    );
     Ok(text)
 }
 
