@@ -41,7 +41,7 @@ const TRUNCATION: u8 = 24;
 /// π of (2), grey levels.
 const OCCLUSION_PENALTY: u8 = 16;
 /// P1 and P2 of (4), half grey levels.
-const STEP_PENALTIES: [u8; 2] = [12, 32];
+pub(super) const STEP_PENALTIES: [u8; 2] = [12, 32];
 /// Rows of a band; more are slower to share out, fewer warm up more often.
 const BAND_ROWS: usize = 120;
 /// Rows until a path has forgotten where it began.
@@ -122,8 +122,8 @@ struct Job {
     pairs: Vec<PairRows>,
     /// How often costs are halved so that a column of a window fits 8 bits.
     halvings: u32,
-    /// Window sum to mean in half grey levels, times 2^16.
-    scale: u16,
+    /// Window sum to mean in half grey levels, times 2^15.
+    scale: i16,
 }
 
 struct PairRows {
@@ -153,7 +153,7 @@ impl Job {
         };
         let side = 2 * radius + 1;
         let halvings = (0..).find(|h| (side * usize::from(2 * TRUNCATION)) >> h <= usize::from(u8::MAX)).unwrap_or(0);
-        let scale = ((1 << (17 + halvings)) / (side * side * pairs.len().max(1))) as u16;
+        let scale = ((1 << (16 + halvings)) / (side * side * pairs.len().max(1))) as i16;
         let pairs = pairs.par_iter().map(rows).collect();
         Self { region, range, radius, depth, width: padded.x.len(), pairs, halvings, scale }
     }
@@ -433,10 +433,12 @@ impl<const N: usize> Rows<N> {
         let reach = 2 * job.radius;
         let Self { ring, columns, means, down, down_least, sums, scratch: [scratch, second] } = self;
         let rows = CostRows::new(job, y, [scratch, second]);
-        let (ring, width) = (&mut ring[oldest][..], means.len());
+        let width = means.len();
+        let (ring_start, ring) = ring[oldest].split_at_mut(reach);
+        let ring = &mut ring[..width];
         let mut window = [L::wide_zero(); N];
         for x in 0..reach {
-            rows.replace::<L, N>(job, x, &mut ring[x], &mut columns[x]);
+            rows.replace::<L, N>(job, x, &mut ring_start[x], &mut columns[x]);
             for k in 0..N {
                 window[k] = L::wide_add(window[k], L::load(&columns[x][k]));
             }
@@ -445,7 +447,7 @@ impl<const N: usize> Rows<N> {
         let mut right = [L::splat(0); N];
         let mut right_least = L::splat(0);
         for x in 0..width {
-            rows.replace::<L, N>(job, x + reach, &mut ring[x + reach], &mut columns[x + reach]);
+            rows.replace::<L, N>(job, x + reach, &mut ring[x], &mut columns[x + reach]);
             let mut cost = [L::splat(0); N];
             for k in 0..N {
                 window[k] = L::wide_add(window[k], L::load(&columns[x + reach][k]));
@@ -654,7 +656,7 @@ mod tests {
                 }
             }
             let area = (2 * radius + 1) * (2 * radius + 1);
-            (sum * (2 << 16 << halvings as u32) / (area as u32 * pairs.len() as u32)) >> 16
+            (sum * ((1 << 16 << halvings) / (area as u32 * pairs.len() as u32)) + (1 << 14)) >> 15
         };
         let costs: Vec<Vec<Vec<u32>>> =
             (0..height).map(|y| (0..width).map(|x| (0..depth).map(|h| mean(x, y, h)).collect()).collect()).collect();

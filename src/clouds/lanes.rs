@@ -36,8 +36,8 @@ pub trait Lanes: Copy {
     fn wide_zero() -> Self::Wide;
     fn wide_add(wide: Self::Wide, other: Self) -> Self::Wide;
     fn wide_sub(wide: Self::Wide, other: Self) -> Self::Wide;
-    /// (wide * factor) >> 16, at most 255.
-    fn scaled(wide: Self::Wide, factor: u16) -> Self;
+    /// wide * factor / 2^15, rounded, for wide and factor below 2^15 and results below 256.
+    fn scaled(wide: Self::Wide, factor: i16) -> Self;
 }
 
 #[inline(always)]
@@ -130,8 +130,8 @@ impl Lanes for [u8; LANES] {
         wide
     }
     #[inline(always)]
-    fn scaled(wide: Self::Wide, factor: u16) -> Self {
-        each(|i| ((u32::from(wide[i]) * u32::from(factor)) >> 16).min(255) as u8)
+    fn scaled(wide: Self::Wide, factor: i16) -> Self {
+        each(|i| ((i32::from(wide[i]) * i32::from(factor) + (1 << 14)) >> 15) as u8)
     }
 }
 
@@ -239,10 +239,10 @@ pub mod avx2 {
             }
         }
         #[inline(always)]
-        fn scaled([low, high]: Self::Wide, factor: u16) -> Self {
+        fn scaled([low, high]: Self::Wide, factor: i16) -> Self {
             unsafe {
-                let factor = _mm256_set1_epi16(factor as i16);
-                Self(_mm256_packus_epi16(_mm256_mulhi_epu16(low, factor), _mm256_mulhi_epu16(high, factor)))
+                let factor = _mm256_set1_epi16(factor);
+                Self(_mm256_packus_epi16(_mm256_mulhrs_epi16(low, factor), _mm256_mulhrs_epi16(high, factor)))
             }
         }
     }

@@ -48,23 +48,20 @@ fn gradient_row_avx2(rows: [&[f32]; 3], along: [f32; 2], out: &mut [u8]) {
 
 /// Equation (1) of the middle row.
 #[inline(always)]
-fn gradient_row_plain([above, here, below]: [&[f32]; 3], [right, down]: [f32; 2], out: &mut [u8]) {
-    let width = out.len();
-    let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
-    let mut smooth = vec![0.0; width + 2];
-    let mut slope = vec![0.0; width + 2];
-    for (x, (smooth, slope)) in smooth[1..=width].iter_mut().zip(&mut slope[1..=width]).enumerate() {
-        *smooth = above[x] + 2.0 * here[x] + below[x];
-        *slope = below[x] - above[x];
+fn gradient_row_plain(rows: [&[f32]; 3], [right, down]: [f32; 2], out: &mut [u8]) {
+    let (width, code) = (out.len(), |slope: f32| (ROUND_TO_128 + slope.clamp(-CAP, CAP)).to_bits() as u8);
+    let Some(inner) = width.checked_sub(2) else { return out.fill(code(0.0)) };
+    let [[a, b, c], [d, _, f], [g, h, i]] = rows.map(|row| [&row[..inner], &row[1..=inner], &row[2..width]]);
+    for (x, out) in out[1..=inner].iter_mut().enumerate() {
+        let across = (c[x] - a[x]) + 2.0 * (f[x] - d[x]) + (i[x] - g[x]);
+        let along = (g[x] - a[x]) + 2.0 * (h[x] - b[x]) + (i[x] - c[x]);
+        *out = code(right * across + down * along);
     }
-    for line in [&mut smooth, &mut slope] {
-        (line[0], line[width + 1]) = (line[1], line[width]);
-    }
-    let (smooth, slope) = ((&smooth[..width], &smooth[2..]), (&slope[..width], &slope[1..=width], &slope[2..]));
-    for x in 0..width {
-        let across = smooth.1[x] - smooth.0[x];
-        let along = slope.0[x] + 2.0 * slope.1[x] + slope.2[x];
-        out[x] = (ROUND_TO_128 + (right * across + down * along).clamp(-CAP, CAP)).to_bits() as u8;
+    let [above, here, below] = rows;
+    for (x, from, to) in [(0, 0, 1), (width - 1, width - 2, width - 1)] {
+        let across = (above[to] - above[from]) + 2.0 * (here[to] - here[from]) + (below[to] - below[from]);
+        let along = (below[from] - above[from]) + 2.0 * (below[x] - above[x]) + (below[to] - above[to]);
+        out[x] = code(right * across + down * along);
     }
 }
 

@@ -2,7 +2,8 @@
 
 use super::correlate::{Matches, Pair, Region, correlate};
 use super::subpixel::equiangular;
-use super::{prefilter, validate};
+use super::prefilter;
+use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
 use image::Luma;
 use nalgebra::Vector2;
@@ -63,23 +64,30 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let steps: Vec<Vector2<f64>> = others_of(views, reference).map(|o| o.step - here.step).collect();
     let per_px = steps.iter().map(Vector2::amax).fold(f64::MIN_POSITIVE, f64::max);
     let steps: Vec<Vector2<f64>> = steps.iter().map(|s| s / per_px).collect();
-    let pair = |(other, step): (&StereoView, &Vector2<f64>)| Pair {
-        reference: prefilter::gradient(&here.plane, *step),
-        other: prefilter::gradient(&other.plane, *step),
-        step: *step,
+    let pair = |(other, step): (&StereoView, &Vector2<f64>)| {
+        let gradient = |plane: &Plane| prefilter::gradient(plane, *step);
+        let (reference, other) = rayon::join(|| gradient(&here.plane), || gradient(&other.plane));
+        Pair { reference, other, step: *step }
     };
-    let pairs: Vec<Pair> = others_of(views, reference).zip(&steps).map(pair).collect();
+    let others: Vec<(&StereoView, &Vector2<f64>)> = others_of(views, reference).zip(&steps).collect();
+    let pairs: Vec<Pair> = others.into_par_iter().map(pair).collect();
     let hypotheses = (range[0] as f64 * per_px) as usize..(range[1] as f64 * per_px).ceil() as usize + 1;
     let matches = correlate(&pairs, region, hypotheses, options.radius);
-    let confirmed = validate::confirmed(&matches, &pairs, (f64::from(options.consistency_px) * per_px) as u16);
+    let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(&matches, pair)).collect();
     let (width, height) = here.plane.dimensions();
     let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
-    let rows = disparity.par_chunks_exact_mut(width as usize).skip(region.y[0]).take(region.height());
-    rows.enumerate().for_each(|(y, row)| {
-        for (i, value) in (y * region.width()..).zip(&mut row[region.x[0]..region.x[1]]) {
-            let cost = matches.cost[i];
-            if confirmed[i] != 0 && validate::unique(cost[1], matches.rival[i], options.uniqueness) {
-                *value = equiangular(cost).map_or(f32::NAN, |offset| (f32::from(matches.best[i]) + offset) / per_px as f32);
+    let mut confirmed = vec![0; matches.best.len()];
+    let (tolerance, px) = ((f64::from(options.consistency_px) * per_px) as u16, (1.0 / per_px) as f32);
+    let planes = disparity.par_chunks_exact_mut(width.max(1) as usize).skip(region.y[0]).take(region.height());
+    planes.zip(confirmed.par_chunks_exact_mut(region.width().max(1))).enumerate().for_each(|(y, (values, confirmed))| {
+        let row = y * region.width()..(y + 1) * region.width();
+        let best = &matches.best[row.clone()];
+        validate::confirm(best, &owners, y, tolerance, confirmed);
+        let costs = matches.cost[row.clone()].iter().zip(&matches.rival[row]);
+        let found = best.iter().zip(costs).zip(confirmed).zip(&mut values[region.x[0]..region.x[1]]);
+        for (((best, (cost, rival)), confirmed), value) in found {
+            if *confirmed != 0 && validate::unique(cost[1], *rival, options.uniqueness) {
+                *value = equiangular(*cost).map_or(f32::NAN, |offset| (f32::from(*best) + offset) * px);
             }
         }
     });

@@ -23,29 +23,22 @@ pub fn unique(cost: u8, rival: u8, ratio: f32) -> bool {
 /// Set beside the views' own bits where any contradicts.
 const CONTRADICTED: u8 = 1 << 7;
 
-/// Bits of the other views of `pairs` that confirm each pixel of the region, none where any contradicts.
-pub fn confirmed(matches: &Matches, pairs: &[Pair], tolerance: u16) -> Vec<u8> {
-    let region = matches.region;
-    let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(matches, pair)).collect();
-    let mut bits = vec![0u8; matches.best.len()];
-    bits.par_chunks_exact_mut(region.width().max(1)).enumerate().for_each(|(y, bits)| {
-        let best = &matches.best[y * region.width()..][..region.width()];
-        for (k, owners) in owners.iter().enumerate() {
-            let keys = &owners.keys[y * owners.width..];
-            for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
-                let Some(shift) = owners.shifts.get(usize::from(h)) else { continue };
-                let owner = keys[x + *shift as usize] as u16;
-                *bits |= u8::from(owner.abs_diff(h) <= tolerance) << k;
-                *bits |= if owner < h.saturating_sub(tolerance) { CONTRADICTED } else { 0 };
-            }
+/// Bits of the views that confirm each pixel of row `y` of a region, none where any contradicts.
+pub fn confirm(best: &[u16], owners: &[Owners], y: usize, tolerance: u16, bits: &mut [u8]) {
+    for (k, owners) in owners.iter().enumerate() {
+        let keys = &owners.keys[y * owners.width..];
+        for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
+            let Some(shift) = owners.shifts.get(usize::from(h)) else { continue };
+            let owner = keys[x + *shift as usize] as u16;
+            *bits |= u8::from(owner.abs_diff(h) <= tolerance) << k;
+            *bits |= if owner < h.saturating_sub(tolerance) { CONTRADICTED } else { 0 };
         }
-        bits.iter_mut().for_each(|bits| *bits = if *bits & CONTRADICTED != 0 { 0 } else { *bits });
-    });
-    bits
+    }
+    bits.iter_mut().for_each(|bits| *bits = if *bits & CONTRADICTED != 0 { 0 } else { *bits });
 }
 
 /// For every place of another view, the cheapest winner that leads to it.
-struct Owners {
+pub struct Owners {
     /// Cost above hypothesis, so that the least key is the cheapest winner, and of equal ones the farthest. Where nothing is
     /// known the hypothesis is [`NO_MATCH`], nearer than all.
     keys: Vec<u32>,
@@ -55,7 +48,7 @@ struct Owners {
 }
 
 impl Owners {
-    fn new(matches: &Matches, pair: &Pair) -> Self {
+    pub fn new(matches: &Matches, pair: &Pair) -> Self {
         let (width, height) = (matches.region.width(), matches.region.height());
         let reach = matches.best.iter().filter(|b| **b != NO_MATCH).max().map_or(0, |b| usize::from(*b) + 1);
         let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (pair.step * h as f64).map(|v| v.round() as isize).into()).collect();
@@ -104,14 +97,17 @@ pub fn remove_speckles(disparity: &mut Plane, area_px: usize, step_px: f32) {
     // Runs of pixels in a row, joined where they touch the row above: start, end, and the run that stands for the piece.
     let runs_of = |row: &[f32]| {
         let mut runs: Vec<[u32; 2]> = Vec::new();
-        for x in 0..width {
-            if row[x].is_nan() {
+        let mut x = 0;
+        while x < row.len() {
+            let start = x;
+            x += 1;
+            if row[start].is_nan() {
                 continue;
             }
-            match runs.last_mut() {
-                Some(run) if run[1] as usize == x && near(row[x], row[x - 1]) => run[1] += 1,
-                _ => runs.push([x as u32, x as u32 + 1]),
+            while x < row.len() && near(row[x], row[x - 1]) {
+                x += 1;
             }
+            runs.push([start as u32, x as u32]);
         }
         runs
     };
@@ -200,11 +196,17 @@ mod tests {
             step: Vector2::new(x, y),
         };
         let at = |bits: &[u8]| [10, 12, 13, 16, 14, 3].map(|i: usize| bits[i]);
-        // 10 is hidden by 12, 13 is near enough to it, 16 would hide it.
-        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0)], 1)), [0, 1, 1, 0, 1, 0]);
-        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)], 1)), [2, 3, 3, 2, 3, 2]);
-        // A third pixel with a farther winner contradicts.
+        let confirmed = |matches: &Matches, pairs: &[Pair]| {
+            let owners: Vec<Owners> = pairs.iter().map(|pair| Owners::new(matches, pair)).collect();
+            let mut bits = vec![0; 20];
+            confirm(&matches.best, &owners, 0, 1, &mut bits);
+            bits
+        };
+        // 10 is hidden by 12, 13 is near enough to it, 16 would hide 12 if it were right.
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0)])), [0, 1, 1, 0, 1, 0]);
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)])), [2, 3, 3, 0, 3, 2]);
+        // A farther winner contradicts all that would hide it.
         (matches.best[8], matches.cost[8][1]) = (2, 1);
-        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)], 1)), [0, 0, 0, 0, 3, 2]);
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)])), [0, 0, 0, 0, 3, 2]);
     }
 }
