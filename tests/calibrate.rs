@@ -192,7 +192,7 @@ fn other_ways_of_giving_the_same(folder: &Path) {
     }
     std::fs::remove_file(folder.join("top/view_003.png")).unwrap();
     std::fs::remove_file(folder.join("left/view_005.png")).unwrap();
-    let globs = ["calibrate", "left/view*.png", "right/v*.png", "top/*", "--board", "9x6", "--square", "0.04", "-o", "globs.toml"];
+    let globs = ["calibrate", "left/view*.png", "right/view*.png", "top/view*.png", "--board", "9x6", "--square", "0.04", "-o", "globs.toml"];
     let output = run(&globs, folder);
     let said = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && said.contains("warning: the world is left's frame"), "{said}");
@@ -517,7 +517,7 @@ fn boards_of_calib_are_made_again_and_found() {
         ),
     ];
     for (name, arguments, board) in boards {
-        assert!(run(&[&["board"], arguments, &["-o", name]].concat(), folder.path()).status.success());
+        assert!(run(&[&["rig", "board"], arguments, &["-o", name]].concat(), folder.path()).status.success());
         let made = std::fs::read(folder.path().join(name)).unwrap();
         if std::env::var_os("REGENERATE").is_some() {
             std::fs::write(calib.join(name), &made).unwrap();
@@ -535,8 +535,8 @@ fn boards_of_calib_are_made_again_and_found() {
             assert!((pixel - origin - expected).norm() < 0.05, "{name}: {id} {:?}", pixel - origin - Vector2::from(expected));
         }
     }
-    let svg = run(&["board", "--board", "9x6", "--square", "0.025", "-o", "b.svg"], folder.path());
+    let svg = run(&["rig", "board", "--board", "9x6", "--square", "0.025", "-o", "b.svg"], folder.path());
     assert!(svg.status.success() && std::fs::read_to_string(folder.path().join("b.svg")).unwrap().contains("width=\"280mm\""));
-    let other = run(&["board", "--board", "9x6", "--square", "0.025", "-o", "b.jpg"], folder.path());
+    let other = run(&["rig", "board", "--board", "9x6", "--square", "0.025", "-o", "b.jpg"], folder.path());
     assert_eq!(other.status.code(), Some(1));
 }

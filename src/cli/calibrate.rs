@@ -5,9 +5,10 @@ use super::{interrupt, progress};
 use anyhow::{Context, Result, bail, ensure};
 use image::GrayImage;
 use muybridge::footage::board::{Board, BoardError};
-use muybridge::io::calib_toml::{read_rig, write_rig};
+use muybridge::io::calib_toml::write_rig;
 use muybridge::io::calib_views::{self, CameraViews};
 use muybridge::io::calibration_json::{self, Source};
+use muybridge::io::{RigReading, read_rig_files};
 use muybridge::report;
 use muybridge::rig::Rig;
 use muybridge::rig::calibrate::{CalibrateOptions, Calibration, Detection, LensKind, Target, Uncalibrated, calibrate};
@@ -48,7 +49,7 @@ pub struct CalibrateArgs {
     /// Square pixels: one focal length for both directions
     #[arg(long)]
     fix_aspect: bool,
-    /// Keep the camera matrices and lenses of this rig file, by the cameras' names; only poses are found
+    /// Keep the camera matrices and lenses of this rig file (of any form), by the cameras' names; only poses are found
     #[arg(long, value_name = "RIG", conflicts_with_all = ["k3", "fix_aspect"])]
     intrinsics: Option<PathBuf>,
     /// The ChArUco board is white where others are black; without it both are tried
@@ -88,7 +89,8 @@ pub fn run(args: &CalibrateArgs) -> Result<()> {
 }
 
 fn uncalibrated(cameras: &[CameraViews], looks: &[Look], intrinsics: Option<&Path>) -> Result<Vec<Uncalibrated>> {
-    let rig = intrinsics.map(|path| anyhow::Ok((path, read_rig(path)?))).transpose()?;
+    let read = |path: &Path| read_rig_files(&[path.to_path_buf()], &RigReading::default()).map(|read| read.rig);
+    let rig = intrinsics.map(|path| anyhow::Ok((path, read(path)?))).transpose()?;
     let one = |(camera, look): (&CameraViews, &Look)| {
         let (name, size_px) = (camera.name.clone(), look.size_px);
         let Some((path, rig)) = &rig else { return Ok(Uncalibrated { name, size_px, known: None }) };
@@ -229,7 +231,7 @@ fn warnings(result: &Calibration, world: &str, no_floor: bool) -> Vec<String> {
     let mut warnings = Vec::new();
     if no_floor {
         warnings.push(format!(
-            "the world is {world}; nothing says where the floor is, so lay the board there in one view and give --floor-view"
+            "the world is {world}; nothing says where the floor is, so lay the board there in one view and give --floor-view (or muybridge rig convert --level --height)"
         ));
     }
     for (camera, q) in result.rig.cameras.iter().zip(&result.quality).filter(|(_, q)| q.coverage < POOR_COVERAGE) {

@@ -38,13 +38,11 @@ enum Command {
     Check(check::CheckArgs),
     /// A rig from pictures of a chessboard or ChArUco board
     Calibrate(calibrate::CalibrateArgs),
-    /// A calibration board to print
-    Board(board::BoardArgs),
     /// The person's point cloud in every frame of a session, as PLY files
     Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
-    /// Rig files: in words and a picture, and from one form to another
+    /// Rig files in words and a picture and from one form to another; boards to calibrate with
     #[command(subcommand)]
     Rig(rig::RigCommand),
     /// Motion databases and their PCA models
@@ -81,7 +79,6 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
-        Command::Board(args) => board::run(&args),
         Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),
