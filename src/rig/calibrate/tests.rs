@@ -337,7 +337,7 @@ fn chains_of_cameras_hold_together_and_the_floor_is_the_world() {
     let cameras = true_cameras(brown());
     let mut boards = true_boards(18, &mut rng);
     // The last board lies on the floor, z into it.
-    boards[17] = Isometry3::new(Vector3::new(-0.1, 0.25, 1.5), Vector3::new(1.2, 0.1, 0.0));
+    boards[17] = Isometry3::new(Vector3::new(-0.1, 0.05, 1.4), Vector3::new(0.8, 0.1, 0.0));
     // a and c never see a board together.
     let chained: Vec<_> = seen(&cameras, &boards, &target, 0.05, &mut rng)
         .into_iter()
@@ -350,7 +350,7 @@ fn chains_of_cameras_hold_together_and_the_floor_is_the_world() {
     for (placed, truth) in world.cameras.iter().zip(&cameras) {
         let on_board = boards[17].inverse_transform_point(&truth.centre().into());
         let expected = Vector3::new(on_board.x, -on_board.y, -on_board.z);
-        assert!((placed.centre() - expected).norm() < 5e-3 && placed.centre().z > 0.2, "{} {expected}", placed.centre());
+        assert!((placed.centre() - expected).norm() < 5e-3 && placed.centre().z > 0.5, "{} {expected}", placed.centre());
     }
 }
 
@@ -368,10 +368,10 @@ fn known_intrinsics_are_kept_and_make_few_views_enough() {
     let found = calibrate(&known, &target, &detections, &PLAIN).unwrap();
     for (a, b) in found.rig.cameras.iter().zip(&cameras) {
         assert_eq!((a.matrix, a.lens), (b.matrix, b.lens));
-        assert!((a.centre() - b.centre()).norm() < 2e-3);
+        assert!((a.centre() - b.centre()).norm() < 6e-3);
     }
     assert_eq!(found.parameters.len(), 12);
     let alone = calibrate(&known[..1], &target, &detections.into_iter().filter(|d| d.camera == 0).collect::<Vec<_>>(), &PLAIN).unwrap();
     assert!(alone.parameters.is_empty() && alone.boards.len() == 4);
-    assert!((alone.boards[&2].translation.vector - boards[2].translation.vector).norm() < 2e-3);
+    assert!((alone.boards[&2].translation.vector - boards[2].translation.vector).norm() < 6e-3);
 }
