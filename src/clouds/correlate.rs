@@ -30,6 +30,9 @@
 //! | kept, 2 / 4 / 5 / 8 paths                                   | 0.65 / 0.62 / 0.60 / 0.62 | 0.94 to 0.95 | 0.57 to 0.63 |
 //! | kept, costs in 1/8 or 1 grey level                          | 0.59 / 0.59 | 0.95 | 0.57 / 0.59 |
 
+// The indexed loops over blocks are what the compiler unrolls.
+#![allow(clippy::needless_range_loop)]
+
 use super::lanes::{LANES, Lanes};
 use image::GrayImage;
 use nalgebra::Vector2;
@@ -485,15 +488,27 @@ impl<const N: usize> Rows<N> {
     }
 }
 
-/// A row of the reference and the hypotheses of its pixels, for each pair.
+/// A row of the reference for each pair.
 struct CostRows<'a> {
-    first: (&'a [u8], (&'a [u8], isize, isize)),
-    second: Option<(&'a [u8], (&'a [u8], isize, isize))>,
+    first: CostRow<'a>,
+    second: Option<CostRow<'a>>,
+}
+
+/// Values of the reference, and where the hypotheses of its pixels lie.
+struct CostRow<'a> {
+    values: &'a [u8],
+    data: &'a [u8],
+    /// Place of the first pixel's hypotheses, and distance to the next pixel's.
+    origin: isize,
+    per_x: isize,
 }
 
 impl<'a> CostRows<'a> {
     fn new(job: &'a Job, y: usize, [scratch, second_scratch]: [&'a mut Vec<u8>; 2]) -> Self {
-        let of = |pair: &'a PairRows, scratch| (pair.reference_row(y, job.width), pair.candidates.row(y, job.width, job.depth, scratch));
+        let of = |pair: &'a PairRows, scratch| {
+            let (data, origin, per_x) = pair.candidates.row(y, job.width, job.depth, scratch);
+            CostRow { values: pair.reference_row(y, job.width), data, origin, per_x }
+        };
         Self { first: of(&job.pairs[0], scratch), second: job.pairs.get(1).map(|pair| of(pair, second_scratch)) }
     }
 
@@ -520,9 +535,9 @@ impl<'a> CostRows<'a> {
 
 /// Equation (1) at pixel x.
 #[inline(always)]
-fn truncated<L: Lanes, const N: usize>((values, (data, origin, per_x)): &(&[u8], (&[u8], isize, isize)), x: usize) -> [L; N] {
-    let value = L::splat(values[x]);
-    let hypotheses = &data[(origin + x as isize * per_x) as usize..][..N * LANES].as_chunks::<LANES>().0[..N];
+fn truncated<L: Lanes, const N: usize>(row: &CostRow, x: usize) -> [L; N] {
+    let value = L::splat(row.values[x]);
+    let hypotheses = &row.data[(row.origin + x as isize * row.per_x) as usize..][..N * LANES].as_chunks::<LANES>().0[..N];
     let mut cost = [value; N];
     for k in 0..N {
         cost[k] = value.abs_diff(L::load(&hypotheses[k])).min(L::splat(TRUNCATION));
@@ -625,7 +640,11 @@ mod tests {
             ((1.0 - (x - u).abs()) * (1.0 - (y - v).abs()), read(image, u as i64, v as i64))
         });
         let counts = |weight: f64| weight > 1e-9;
-        if taps.iter().any(|(weight, value)| counts(*weight) && *value == 0.0) { 0.0 } else { taps.iter().map(|(w, v)| w * v).sum::<f64>().round() }
+        if taps.iter().any(|(weight, value)| counts(*weight) && *value == 0.0) {
+            0.0
+        } else {
+            taps.iter().map(|(w, v)| w * v).sum::<f64>().round()
+        }
     }
 
     /// Equations (1) and (2), grey levels.
@@ -743,12 +762,8 @@ mod tests {
         // The other view is the reference moved by 20 px; the band of 20 px without a partner stays expensive.
         let a = noise(4);
         let moved = GrayImage::from_fn(61, 40, |x, y| if x + 20 < 61 { *a.get_pixel(x + 20, y) } else { Luma([0]) });
-        let found = correlate(
-            &[Pair { reference: a, other: moved, step: Vector2::new(-1.0, 0.0) }],
-            Region { x: [0, 61], y: [0, 40] },
-            0..32,
-            2,
-        );
+        let found =
+            correlate(&[Pair { reference: a, other: moved, step: Vector2::new(-1.0, 0.0) }], Region { x: [0, 61], y: [0, 40] }, 0..32, 2);
         let column = |x: usize| (5..35).map(move |y| y * 61 + x);
         assert!((30..61).flat_map(column).all(|i| found.best[i] == 20 || found.best[i] == NO_MATCH));
         assert!((0..12).flat_map(column).all(|i| found.cost[i][1] > 60));
