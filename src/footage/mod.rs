@@ -1,8 +1,11 @@
 //! Simultaneous images with times, synchronization check, foreground.
 
+pub mod board;
 pub mod check;
+pub mod corner;
 pub mod epipolar;
 pub mod foreground;
+pub mod pattern;
 pub mod regions;
 
 pub use foreground::{ForegroundOptions, foreground, spread, stage_from_frames};

@@ -220,7 +220,7 @@ impl Frames<'_> {
 }
 
 /// Visible names in a folder, naturally sorted.
-fn list(folder: &Path) -> Result<Vec<PathBuf>, SessionError> {
+pub(super) fn list(folder: &Path) -> Result<Vec<PathBuf>, SessionError> {
     let failed = |error| SessionError::Read { path: folder.into(), error };
     let paths =
         std::fs::read_dir(folder).map_err(failed)?.map(|entry| entry.map(|e| e.path())).collect::<Result<Vec<_>, _>>().map_err(failed)?;
@@ -229,11 +229,11 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>, SessionError> {
     Ok(named.into_iter().map(|(_, path)| path).collect())
 }
 
-fn file_name(path: &Path) -> String {
+pub(super) fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-fn stem(path: &Path) -> String {
+pub(super) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
@@ -287,15 +287,20 @@ fn open_images(
 }
 
 /// The pictures of a folder by ascending frame number, at least one.
-fn numbered_images(folder: &Path) -> Result<Vec<(usize, PathBuf)>, SessionError> {
+pub(super) fn numbered_images(folder: &Path) -> Result<Vec<(usize, PathBuf)>, SessionError> {
+    numbered(folder, list(folder)?)
+}
+
+/// The pictures among `files`, of which `place` holds or names all.
+pub(super) fn numbered(place: &Path, files: Vec<PathBuf>) -> Result<Vec<(usize, PathBuf)>, SessionError> {
     let is_picture = |path: &PathBuf| images::is_image_name(path) && !path.is_dir();
     let number = |path: PathBuf| Ok((frame_number(&path).ok_or_else(|| SessionError::NoNumber { path: path.clone() })?, path));
-    let mut files = list(folder)?.into_iter().filter(is_picture).map(number).collect::<Result<Vec<_>, SessionError>>()?;
+    let mut files = files.into_iter().filter(is_picture).map(number).collect::<Result<Vec<_>, SessionError>>()?;
     files.sort_by_key(|(number, _)| *number);
     if let Some(pair) = files.windows(2).find(|pair| pair[0].0 == pair[1].0) {
         return Err(SessionError::SameNumber { number: pair[0].0, first: pair[0].1.clone(), second: pair[1].1.clone() });
     }
-    if files.is_empty() { Err(SessionError::Empty { path: folder.into() }) } else { Ok(files) }
+    if files.is_empty() { Err(SessionError::Empty { path: place.into() }) } else { Ok(files) }
 }
 
 /// The last run of digits in the name, without the extension.

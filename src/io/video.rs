@@ -50,6 +50,12 @@ pub fn count_frames(path: &Path) -> Result<VideoFacts, VideoError> {
     Ok(VideoFacts { size_px, fps, promised, decoded })
 }
 
+/// Number of frames by the header; `None` where it does not say or cannot be read.
+pub fn promised_frames(path: &Path) -> Option<usize> {
+    let count = Video::open(path).ok()?.capture.get(videoio::CAP_PROP_FRAME_COUNT).ok()?;
+    (count > 0.0).then_some(count as usize)
+}
+
 /// A video being read.
 pub struct Video {
     path: PathBuf,
