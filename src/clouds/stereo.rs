@@ -75,7 +75,7 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let matches = correlate(&pairs, region, hypotheses, options.radius);
     let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(&matches, pair)).collect();
     let (width, height) = here.plane.dimensions();
-    let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    let mut disparity = Plane::from_raw(width, height, vec![f32::NAN; (width * height) as usize]).expect("one value per pixel");
     let mut confirmed = vec![0; (width * height) as usize];
     let (tolerance, px) = ((f64::from(options.consistency_px) * per_px) as u16, (1.0 / per_px) as f32);
     let rows = disparity.par_chunks_exact_mut(width.max(1) as usize).zip(confirmed.par_chunks_exact_mut(width.max(1) as usize));
