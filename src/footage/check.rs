@@ -1,19 +1,25 @@
 //! What footage lets one expect before any long work: is somebody in view, do they move, is the light usable, does the
 //! calibration fit, are the cameras simultaneous.
+//!
+//! All frames are looked at once, reduced; the rest is measured at some instants. A lens out of focus leaves less detail
+//! (pixels against their neighbours, as a share of the contrast) than the other cameras have of the same stage.
 
 use super::epipolar::PairResidual;
-use super::foreground::{ForegroundOptions, foreground, spread};
+use super::foreground::{ForegroundOptions, foreground};
+use super::reduce::{reduced, reduction};
+use super::synchrony::{Offset, Signatures};
 use super::{FrameSet, regions};
+use crate::math::order::quantile;
 use crate::rig::Rig;
 use image::GrayImage;
 use rayon::prelude::*;
 
-/// Epipolar residuals of rigs that fit stay well below this.
-const LARGEST_RESIDUAL_PX: f64 = 1.5;
+/// Calibrations leave some tenths of a pixel, matches add one; half a pixel starts to cost matches and depth.
+const MISFIT_PX: f64 = 0.5;
+/// Correlation windows beyond this distance from the true line see something else.
+const UNUSABLE_PX: f64 = 2.0;
 /// A median of fewer matches says little.
 const FEWEST_MATCHES: usize = 20;
-/// Pictures kept for the test of simultaneity.
-const SAMPLES: usize = 5;
 /// Frames held in memory at once.
 const CHUNK: usize = 16;
 /// Mean grey below which a picture counts as dark.
@@ -22,6 +28,16 @@ const DARK_GREY: f64 = 15.0;
 const BRIGHT_SHARE: f64 = 0.25;
 /// Masks that overlap more than this in every frame show nobody moving.
 const STILL_OVERLAP: f64 = 0.9;
+/// Standard deviation of grey levels below which a picture shows nothing.
+const EVEN_GREY: f64 = 3.0;
+/// A camera with less than this share of the others' relative detail is out of focus.
+const BLUR_SHARE: f64 = 0.25;
+/// Cameras further apart in time are refused; what is left after whole frames are cut is less.
+const LARGEST_OFFSET: f64 = 0.5;
+/// Smaller offsets do no harm: 3 ms at 30 frames per second move a foot by a centimetre.
+const HARMLESS_OFFSET: f64 = 0.1;
+/// Offsets within this many standard deviations of zero may be none.
+const SIGNIFICANT: f64 = 3.0;
 
 /// What was seen by one camera.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -34,35 +50,50 @@ pub struct CameraFacts {
     pub overexposed_frames: usize,
     /// Smallest intersection over union of a frame's mask with the first one that is not empty.
     pub least_overlap: f64,
+    /// Standard deviation of the stage's grey levels.
+    pub contrast_grey: f64,
+    /// Detail of the stage over its contrast.
+    pub detail: f64,
 }
 
 /// What was seen in all frames.
-#[derive(Clone, Debug, Default)]
 pub struct Survey {
     pub frames: usize,
     pub cameras: Vec<CameraFacts>,
-    /// Some frames with their masks, spread over time.
-    pub samples: Vec<(FrameSet, Vec<GrayImage>)>,
+    /// Numbers of the frames in which every camera sees somebody, ascending.
+    pub together: Vec<usize>,
+    pub signatures: Signatures,
 }
 
-/// Looks at all frames, of which there are `count`, against the stage pictures (one per camera).
-pub fn survey<E>(frames: impl Iterator<Item = Result<FrameSet, E>>, count: usize, stages: &[GrayImage]) -> Result<Survey, E> {
-    let sampled = spread(count, SAMPLES);
-    let mut survey = Survey { cameras: vec![CameraFacts { least_overlap: 1.0, ..Default::default() }; stages.len()], ..Default::default() };
+/// Looks at all frames against the stage pictures (one per camera of the rig).
+pub fn survey<E>(frames: impl Iterator<Item = Result<FrameSet, E>>, rig: &Rig, stages: &[GrayImage]) -> Result<Survey, E> {
+    let factors: Vec<u32> = rig.cameras.iter().map(|c| reduction(c.size_px)).collect();
+    let stages: Vec<GrayImage> = stages.iter().zip(&factors).map(|(s, f)| reduced(s, *f)).collect();
+    let mut survey = Survey {
+        frames: 0,
+        cameras: stages.iter().map(CameraFacts::of_stage).collect(),
+        together: Vec::new(),
+        signatures: Signatures::new(rig),
+    };
     let mut first_masks = vec![None; stages.len()];
     let mut frames = frames.peekable();
     while frames.peek().is_some() {
         let chunk = frames.by_ref().take(CHUNK).collect::<Result<Vec<_>, E>>()?;
-        let options = ForegroundOptions::default();
-        let masks_of = |frame: &FrameSet| frame.images.iter().zip(stages).map(|(i, s)| foreground(i, s, &options)).collect::<Vec<_>>();
-        let masks: Vec<Vec<GrayImage>> = chunk.par_iter().map(masks_of).collect();
-        for (frame, masks) in chunk.into_iter().zip(masks) {
-            for (k, (image, mask)) in frame.images.iter().zip(&masks).enumerate() {
+        let look = |frame: &FrameSet| {
+            let images: Vec<GrayImage> = frame.images.iter().zip(&factors).map(|(i, f)| reduced(i, *f)).collect();
+            let masks = masks(&images, &stages);
+            let signature = survey.signatures.signature(&masks);
+            (images, masks, signature)
+        };
+        let seen: Vec<_> = chunk.par_iter().map(look).collect();
+        for (frame, (images, masks, signature)) in chunk.iter().zip(seen) {
+            for (k, (image, mask)) in images.iter().zip(&masks).enumerate() {
                 survey.cameras[k].add(image, mask, &mut first_masks[k]);
             }
-            if sampled.contains(&survey.frames) {
-                survey.samples.push((frame, masks));
+            if masks.iter().all(|m| regions::area_px(m) > 0) {
+                survey.together.push(frame.number);
             }
+            survey.signatures.push(frame.number, signature);
             survey.frames += 1;
         }
     }
@@ -70,7 +101,17 @@ pub fn survey<E>(frames: impl Iterator<Item = Result<FrameSet, E>>, count: usize
     Ok(survey)
 }
 
+/// What stands before the stages, one mask per picture.
+pub fn masks(images: &[GrayImage], stages: &[GrayImage]) -> Vec<GrayImage> {
+    images.iter().zip(stages).map(|(image, stage)| foreground(image, stage, &ForegroundOptions::default())).collect()
+}
+
 impl CameraFacts {
+    fn of_stage(stage: &GrayImage) -> CameraFacts {
+        let (contrast_grey, detail) = contrast_and_detail(stage);
+        CameraFacts { least_overlap: 1.0, contrast_grey, detail, ..Default::default() }
+    }
+
     fn add(&mut self, image: &GrayImage, mask: &GrayImage, first: &mut Option<GrayImage>) {
         let pixels = image.len().max(1) as f64;
         let area_px = regions::area_px(mask);
@@ -85,6 +126,19 @@ impl CameraFacts {
             None => {}
         }
     }
+}
+
+/// Standard deviation of the grey levels, and of pixels against the mean of their four neighbours as a share of it.
+fn contrast_and_detail(image: &GrayImage) -> (f64, f64) {
+    let n = image.len().max(1) as f64;
+    let mean = image.iter().map(|&p| f64::from(p)).sum::<f64>() / n;
+    let contrast = (image.iter().map(|&p| (f64::from(p) - mean).powi(2)).sum::<f64>() / n).sqrt();
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let at = |x: usize, y: usize| f64::from(image.as_raw()[y * width + x]);
+    let stands_out = |x: usize, y: usize| at(x, y) - (at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1)) / 4.0;
+    let inner = (1..height.saturating_sub(1)).flat_map(|y| (1..width.saturating_sub(1)).map(move |x| (x, y)));
+    let squares: f64 = inner.map(|(x, y)| stands_out(x, y).powi(2)).sum();
+    (contrast, (squares / n).sqrt() / contrast.max(1.0))
 }
 
 /// Intersection over union.
@@ -120,34 +174,88 @@ impl Survey {
                     camera.name
                 ));
             }
+            if facts.contrast_grey >= EVEN_GREY && facts.detail < BLUR_SHARE * self.usual_detail() {
+                let share = 100.0 * facts.detail / self.usual_detail();
+                warnings.push(format!("{}: shows {share:.0} % of the detail that the other cameras see; focus its lens", camera.name));
+            }
         }
         if all > 1 && self.somebody_in_view() && self.cameras.iter().all(|c| c.least_overlap > STILL_OVERLAP) {
             warnings.push("nothing moves in these pictures; a motion cannot be measured from them".into());
         }
         warnings
     }
+
+    /// Why no tracking can come of this footage.
+    pub fn refusal(&self, rig: &Rig) -> Option<String> {
+        let (camera, facts) = rig.cameras.iter().zip(&self.cameras).find(|(_, facts)| facts.contrast_grey < EVEN_GREY)?;
+        let grey = facts.contrast_grey;
+        Some(format!(
+            "{}: shows nothing but an even grey (contrast of {grey:.1} grey levels); take off the lens cap, switch on the light, or focus",
+            camera.name
+        ))
+    }
+
+    /// The upper median of the cameras' detail.
+    fn usual_detail(&self) -> f64 {
+        quantile(self.cameras.iter().map(|c| c.detail).collect(), 0.5).unwrap_or(0.0)
+    }
 }
 
-/// What the residuals of the still stage say about the calibration, and those of the person about simultaneity.
-pub fn residual_warnings(rig: &Rig, stage: &[PairResidual], person: &[PairResidual]) -> Vec<String> {
-    let mut warnings = Vec::new();
-    for (still, moving) in stage.iter().zip(person) {
-        let pair = format!("{} and {}", rig.cameras[still.first].name, rig.cameras[still.second].name);
-        let [still_px, moving_px] = [still, moving].map(|r| r.median_px.filter(|_| r.matches >= FEWEST_MATCHES));
-        match (still_px, moving_px) {
-            (None, _) => warnings.push(format!("{pair}: too few common corners ({}) to judge the calibration", still.matches)),
-            (Some(px), _) if px > LARGEST_RESIDUAL_PX => {
-                warnings.push(format!("{pair}: calibration does not fit these pictures, common corners lie {px:.1} px from their epipolar lines; calibrate again"));
-            }
-            (Some(_), Some(px)) if px > LARGEST_RESIDUAL_PX => {
-                warnings.push(format!(
-                    "{pair}: the person lies {px:.1} px from the epipolar lines but the stage fits; the cameras are not synchronous"
-                ));
-            }
-            _ => {}
+/// How a residual is judged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fit {
+    /// Too few matches.
+    Unknown,
+    Good,
+    /// Usable, but worth a new calibration.
+    Loose,
+    Unusable,
+}
+
+impl Fit {
+    pub fn of(residual: &PairResidual) -> Fit {
+        match residual.median_px.filter(|_| residual.matches >= FEWEST_MATCHES) {
+            None => Fit::Unknown,
+            Some(px) if px > UNUSABLE_PX => Fit::Unusable,
+            Some(px) if px > MISFIT_PX => Fit::Loose,
+            Some(_) => Fit::Good,
         }
     }
-    warnings
+}
+
+/// What the times of the cameras mean: a refusal, and warnings.
+pub fn judge_offsets(rig: &Rig, offsets: &[Option<Offset>], fps: f64) -> (Option<String>, Vec<String>) {
+    let name = |k: usize| rig.cameras[k].name.as_str();
+    let known: Vec<(usize, Offset)> = offsets.iter().enumerate().filter_map(|(k, o)| Some((k, (*o)?))).collect();
+    let significant = |o: &Offset, limit: f64| o.frames.abs() > limit && o.frames.abs() > SIGNIFICANT * o.sigma;
+    let text = |k: usize, o: &Offset| {
+        let side = if o.frames > 0.0 { "after" } else { "before" };
+        let (frames, ms) = (o.frames.abs(), 1e3 * o.frames.abs() / fps);
+        format!("{}: its pictures were taken {frames:.2} +- {:.2} frames ({ms:.0} ms) {side} those of the same number", name(k), o.sigma)
+    };
+    let late = known.iter().filter(|(_, o)| significant(o, LARGEST_OFFSET)).max_by(|a, b| a.1.frames.abs().total_cmp(&b.1.frames.abs()));
+    let refusal = late.map(|(k, o)| format!("{}; {}", text(*k, o), remedy(rig, &known)));
+    let mut warnings: Vec<String> = known
+        .iter()
+        .filter(|(_, o)| significant(o, HARMLESS_OFFSET) && !significant(o, LARGEST_OFFSET))
+        .map(|(k, o)| format!("{}; fast limbs will be blurred, use a trigger", text(*k, o)))
+        .collect();
+    warnings.extend((0..offsets.len()).filter(|&k| offsets[k].is_none()).map(|k| {
+        format!("{}: the motion does not tell when its pictures were taken; film somebody who walks or jumps to be sure", name(k))
+    }));
+    (refusal, warnings)
+}
+
+/// Which cameras must lose how many frames at their start.
+fn remedy(rig: &Rig, known: &[(usize, Offset)]) -> String {
+    let latest = known.iter().map(|(_, o)| o.frames).fold(f64::NEG_INFINITY, f64::max);
+    let cuts: Vec<String> = known
+        .iter()
+        .map(|(k, o)| (&rig.cameras[*k].name, (latest - o.frames).round() as usize))
+        .filter(|(_, frames)| *frames > 0)
+        .map(|(name, frames)| format!("the first {frames} of {name}"))
+        .collect();
+    format!("cut {} and number the frames anew, or start the cameras with one trigger", cuts.join(" and "))
 }
 
 #[cfg(test)]

@@ -3,7 +3,11 @@
 pub mod check;
 pub mod epipolar;
 pub mod foreground;
+pub mod misfit;
+pub mod person;
+pub mod reduce;
 pub mod regions;
+pub mod synchrony;
 
 pub use foreground::{ForegroundOptions, foreground, spread, stage_from_frames};
 
