@@ -13,6 +13,7 @@ use crate::math::order::quantile;
 use crate::rig::Rig;
 use image::GrayImage;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 
 /// Calibrations leave some tenths of a pixel, matches add one; half a pixel starts to cost matches and depth.
 const MISFIT_PX: f64 = 0.5;
@@ -249,13 +250,11 @@ pub fn judge_offsets(rig: &Rig, offsets: &[Option<Offset>], fps: f64) -> (Option
 /// Which cameras must lose how many frames at their start.
 fn remedy(rig: &Rig, known: &[(usize, Offset)]) -> String {
     let latest = known.iter().map(|(_, o)| o.frames).fold(f64::NEG_INFINITY, f64::max);
-    let cuts: Vec<String> = known
-        .iter()
-        .map(|(k, o)| (&rig.cameras[*k].name, (latest - o.frames).round() as usize))
-        .filter(|(_, frames)| *frames > 0)
-        .map(|(name, frames)| format!("the first {frames} of {name}"))
-        .collect();
-    format!("cut {} and number the frames anew, or start the cameras with one trigger", cuts.join(" and "))
+    let mut cuts: BTreeMap<usize, Vec<&str>> = BTreeMap::new();
+    known.iter().for_each(|(k, o)| cuts.entry((latest - o.frames).round() as usize).or_default().push(&rig.cameras[*k].name));
+    let frames = |count: usize| if count == 1 { "frame".into() } else { format!("{count} frames") };
+    let texts = cuts.iter().filter(|(count, _)| **count > 0).map(|(&count, names)| format!("the first {} of {}", frames(count), names.join(" and ")));
+    format!("cut {} and number all from the same again, or start the cameras with one trigger", texts.collect::<Vec<_>>().join(" and "))
 }
 
 #[cfg(test)]

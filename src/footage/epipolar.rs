@@ -22,6 +22,10 @@ const WINDOW_RADIUS_PX: i64 = 6;
 const BAND_PX: i64 = 20;
 /// Matches below this correlation are chance; noise of 2 grey levels on weak texture leaves 0.9.
 const LOWEST_CORRELATION: f64 = 0.85;
+/// First the band is sought at this step; texture finer than two of it would be missed.
+const COARSE_PX: usize = 2;
+/// What correlation a step aside leaves of a match.
+const LOWEST_COARSE: f64 = 0.4;
 /// How far the way back may end from the corner.
 const RETURN_PX: f64 = 2.0;
 /// The nearest depth searched, in baselines.
@@ -96,31 +100,29 @@ fn matches(from: &Camera, to: &Camera, images: [&GrayImage; 2], mask: Option<&Gr
     corners.par_iter().map(found).collect::<Vec<_>>().into_iter().flatten().collect()
 }
 
-/// The best match so far: a pixel, the curve's point beside it and the normal there.
-struct Candidate {
-    correlation: f64,
-    at: Option<(i64, i64, Point2<f64>, Vector2<f64>)>,
-}
-
-/// The best place of a pixel's surroundings in the other picture.
+/// The best place of a pixel's surroundings in the other picture: over every second pixel of the band, then around the best.
 fn best_match(from: &Camera, to: &Camera, images: [&GrayImage; 2], pixel: Point2<f64>, nearest_m: f64) -> Option<Match> {
     let rounded = Point2::new(pixel.x.round(), pixel.y.round());
     let window = Window::at(images[0], rounded.x as i64, rounded.y as i64)?;
-    let score = |x: i64, y: i64| Window::at(images[1], x, y).map(|other| window.correlation(&other));
-    let mut best = Candidate { correlation: LOWEST_CORRELATION, at: None };
-    for (point, normal) in curve(from, to, &rounded, nearest_m)? {
-        for offset in -BAND_PX..=BAND_PX {
-            let at = point + normal * offset as f64;
+    let score = |x: i64, y: i64| Window::at(images[1], x, y).map_or(-1.0, |other| window.correlation(&other));
+    let band = || (-BAND_PX..=BAND_PX).step_by(COARSE_PX);
+    let (mut highest, mut best) = (LOWEST_COARSE, None);
+    for (point, normal) in curve(from, to, &rounded, nearest_m)?.into_iter().step_by(COARSE_PX) {
+        for at in band().map(|offset| point + normal * offset as f64) {
             let (x, y) = (at.x.round() as i64, at.y.round() as i64);
-            if let Some(correlation) = score(x, y).filter(|c| *c > best.correlation) {
-                best = Candidate { correlation, at: Some((x, y, point, normal)) };
+            let correlation = score(x, y);
+            if correlation > highest {
+                (highest, best) = (correlation, Some((x, y, point, normal)));
             }
         }
     }
-    let (x, y, point, normal) = best.at?;
-    let shift = |before: Option<f64>, after: Option<f64>| peak(before.unwrap_or(0.0), best.correlation, after.unwrap_or(0.0));
+    let (x, y, point, normal) = best?;
+    let reach = COARSE_PX as i64;
+    let around = (y - reach..=y + reach).flat_map(|y| (x - reach..=x + reach).map(move |x| (x, y)));
+    let (x, y, top) = around.map(|(x, y)| (x, y, score(x, y))).max_by(|a, b| a.2.total_cmp(&b.2))?;
+    let shift = |before: f64, after: f64| peak(before.max(0.0), top, after.max(0.0));
     let place = Point2::new(x as f64 + shift(score(x - 1, y), score(x + 1, y)), y as f64 + shift(score(x, y - 1), score(x, y + 1)));
-    Some(Match { first_px: pixel, second_px: place, normal, distance_px: (place - point).dot(&normal) })
+    (top > LOWEST_CORRELATION).then(|| Match { first_px: pixel, second_px: place, normal, distance_px: (place - point).dot(&normal) })
 }
 
 /// Points 1 px apart along the epipolar curve of a pixel, each with the unit normal there.
