@@ -57,8 +57,10 @@ impl Findings {
     pub fn warnings(&self, session: &Session) -> Vec<String> {
         let rig = &session.rig;
         let mut warnings = self.seen.warnings(rig);
-        if self.seen.refusal(rig).is_none() {
-            warnings.extend(self.fault.iter().filter(|_| !self.unusable()).map(|f| fault_text(rig, f)));
+        match &self.fault {
+            Some(fault) if !self.unusable() => warnings.push(fault_text(rig, fault)),
+            None if self.seen.refusal(rig).is_none() => warnings.extend(self.still.iter().filter_map(|r| residual_warning(rig, r))),
+            _ => {}
         }
         warnings.extend(judge_offsets(rig, &self.offsets, session.fps).1);
         warnings
@@ -76,10 +78,34 @@ impl Findings {
         }
     }
 
+    /// Measures what needs a calibration that fits: residuals and size of the person, and the cameras' times.
+    fn look_at_person(&mut self, session: &Session, stages: &[GrayImage]) -> Result<()> {
+        let rig = &session.rig;
+        let coarse = self.seen.signatures.offsets();
+        let shifts = whole_shifts(rig, &coarse);
+        let instants = instants(session, &self.seen.together, &shifts)?;
+        let small = small_masks(rig, stages, &instants);
+        let moving = matches_on_person(rig, &instants, &small);
+        let mut fine = Vec::new();
+        for pair in &moving {
+            if let Some(mut found) = synchrony::pair_offset(pair, &instants)? {
+                found.offset.frames -= (shifts[pair.second] - shifts[pair.first]) as f64;
+                fine.push(found);
+            }
+        }
+        self.person = person::measure(rig, &moving, &small);
+        self.moving = moving.iter().map(PairResidual::from).collect();
+        self.offsets = camera_offsets(rig.cameras.len(), &synchrony::better(&coarse, &fine));
+        Ok(())
+    }
+
     /// Whether the misfit is more than correlation bears.
     fn unusable(&self) -> bool {
-        let turned = matches!(self.fault, Some(Fault::Turned { .. } | Fault::Whole | Fault::NothingInCommon { .. }) | None);
-        !turned || self.still.iter().any(|r| matches!(Fit::of(r), Fit::Unusable | Fit::Unknown))
+        match self.fault {
+            None => false,
+            Some(Fault::Turned { .. }) => self.still.iter().any(|r| matches!(Fit::of(r), Fit::Unusable | Fit::Unknown)),
+            Some(_) => true,
+        }
     }
 }
 
@@ -98,22 +124,29 @@ pub fn look(session: &Session) -> Result<Findings> {
     );
     let still: Vec<PairResidual> = pair_matches(rig, &[&stages], None).iter().map(PairResidual::from).collect();
     let fits = still.iter().all(|r| Fit::of(r) == Fit::Good);
-    let fault = if fits || seen.refusal(rig).is_some() { None } else { diagnose(rig, &stages)? };
-    let coarse = seen.signatures.offsets();
-    let shifts = whole_shifts(rig, &coarse);
-    let instants = instants(session, &seen.together, &shifts)?;
-    let small = small_masks(rig, &stages, &instants);
-    let moving = matches_on_person(rig, &instants, &small);
-    let person = person::measure(rig, &moving, &small);
-    let mut fine = Vec::new();
-    for pair in &moving {
-        if let Some(mut found) = synchrony::pair_offset(pair, &instants)? {
-            found.offset.frames -= (shifts[pair.second] - shifts[pair.first]) as f64;
-            fine.push(found);
+    let blind = seen.refusal(rig).is_some();
+    let fault = if fits || blind { None } else { diagnose(rig, &stages)? };
+    let mut found = Findings { seen, still, moving: Vec::new(), fault, offsets: Vec::new(), person: None };
+    if !blind && !found.unusable() {
+        found.look_at_person(session, &stages)?;
+    }
+    Ok(found)
+}
+
+/// What a misfit means that no fault explains.
+fn residual_warning(rig: &Rig, residual: &PairResidual) -> Option<String> {
+    let pair = format!("{} and {}", rig.cameras[residual.first].name, rig.cameras[residual.second].name);
+    match Fit::of(residual) {
+        Fit::Good => None,
+        Fit::Unknown => Some(format!(
+            "{pair}: too few common corners ({}) to judge the calibration; do both see the stage sharply, and has it texture?",
+            residual.matches
+        )),
+        Fit::Loose | Fit::Unusable => {
+            let px = residual.median_px.unwrap_or(0.0);
+            Some(format!("{pair}: common corners lie {px:.1} px from their epipolar lines; calibrate again"))
         }
     }
-    let offsets = if fault.is_none() { camera_offsets(rig.cameras.len(), &synchrony::better(&coarse, &fine)) } else { Vec::new() };
-    Ok(Findings { seen, still, moving: moving.iter().map(PairResidual::from).collect(), fault, offsets, person })
 }
 
 /// How many frames later each camera's pictures must be taken to be about simultaneous.
@@ -185,7 +218,8 @@ fn fault_text(rig: &Rig, fault: &Fault) -> String {
         }
         Fault::Turned { cameras, angle_deg } => {
             let names = cameras.iter().map(|&k| name(k)).collect::<Vec<_>>().join(" or ");
-            format!("{names} is turned by {angle_deg:.1} degrees against the calibration: calibrate again")
+            let other = if *angle_deg > 1.0 { ", or take the Calib.toml of this rig" } else { "" };
+            format!("{names} is turned by {angle_deg:.1} degrees (or moved) against the calibration: calibrate again{other}")
         }
         Fault::Whole => "the calibration does not fit these pictures, and no single camera explains it; is this Calib.toml of this rig? Calibrate again".into(),
         Fault::NothingInCommon { first, second, matches } => format!(
@@ -251,13 +285,21 @@ fn print_session(session: &Session) {
 fn print_findings(session: &Session, found: &Findings) {
     let name = |k: usize| &session.rig.cameras[k].name;
     for (camera, facts) in session.rig.cameras.iter().zip(&found.seen.cameras) {
-        println!("{}: foreground {:.1} % of the picture", camera.name, 100.0 * facts.foreground_share);
+        println!(
+            "{}: foreground {:.1} % of the picture; stage: contrast {:.0} grey levels, detail {:.2} of it",
+            camera.name,
+            100.0 * facts.foreground_share,
+            facts.contrast_grey,
+            facts.detail
+        );
     }
     if let Some(person) = found.person {
         println!("person: {:.2} m tall, feet at {:.2} m", person.height_m, person.feet_m);
     }
     println!("\ndistance of common corners from their epipolar lines, median");
-    found.still.iter().zip(&found.moving).for_each(|(still, moving)| print_pair(session, still, moving));
+    for (k, still) in found.still.iter().enumerate() {
+        print_pair(session, still, found.moving.get(k));
+    }
     if found.offsets.iter().any(Option::is_some) {
         println!("\ntime of the pictures against the other cameras'");
     }
@@ -268,11 +310,12 @@ fn print_findings(session: &Session, found: &Findings) {
     }
 }
 
-fn print_pair(session: &Session, still: &PairResidual, moving: &PairResidual) {
+fn print_pair(session: &Session, still: &PairResidual, moving: Option<&PairResidual>) {
     let text = |r: &PairResidual| match r.median_px {
         Some(px) => format!("{px:.2} px ({} corners)", r.matches),
         None => "no corners".into(),
     };
     let name = |k: usize| &session.rig.cameras[k].name;
-    println!("{} and {}: stage {}, person {}", name(still.first), name(still.second), text(still), text(moving));
+    let person = moving.map_or(String::new(), |m| format!(", person {}", text(m)));
+    println!("{} and {}: stage {}{person}", name(still.first), name(still.second), text(still));
 }

@@ -33,8 +33,12 @@ const EXPLAINED: f64 = 0.6;
 const WIDEST_PX: f64 = 80.0;
 /// A pull to no turn, (matches' error in px / turns to expect in radians)², for directions that no pair sees well.
 const PULL: f64 = 100.0;
-/// Two cameras whose turns explain nearly the same cannot be told apart.
-const ALIKE: f64 = 0.97;
+/// Places of features scatter by less than this about right lines; width of ρ.
+const SCATTER_PX: f64 = 1.0;
+/// A turn must leave less than this of Σ ρ.
+const BETTER: f64 = 0.7;
+/// Cameras whose turns leave Σ ρ within this factor of the least cannot be told apart.
+const ALIKE: f64 = 1.15;
 
 /// What was done to the pictures of a camera against those that the calibration saw.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,14 +80,14 @@ struct Features {
     descriptors: Mat,
 }
 
-/// Why simultaneous pictures, best of the empty stage, do not fit the rig; `None` where they do.
+/// Why simultaneous pictures, best of the empty stage, do not fit the rig; `None` where the features see no fault.
 pub fn diagnose(rig: &Rig, images: &[GrayImage]) -> Result<Option<Fault>, MisfitError> {
     let plain = images.iter().map(features).collect::<Result<Vec<_>, _>>()?;
     let pairs: Vec<(usize, usize)> = rig.baselines_m().iter().map(|b| (b.0, b.1)).collect();
     let matched = pairs.iter().map(|&(i, k)| common(&plain[i], &plain[k])).collect::<Result<Vec<Pairs>, _>>()?;
     let fits = |rig: &Rig| explains(rig, &pairs, &matched);
     if fits(rig) {
-        return Ok(None);
+        return Ok(turned(rig, &pairs, &matched));
     }
     if let Some(seen_by) = permutations(rig.cameras.len()).into_iter().skip(1).find(|order| fits(&permuted(rig, order))) {
         return Ok(Some(exchange(seen_by)));
@@ -259,16 +263,29 @@ fn undo(p: &Point2<f64>, change: Change, image: &GrayImage) -> Point2<f64> {
 fn turned(rig: &Rig, pairs: &[(usize, usize)], matched: &[Pairs]) -> Option<Fault> {
     let try_camera = |camera: usize| {
         let turn = best_turn(rig, camera, pairs, matched);
-        let mut rig = rig.clone();
-        rig.cameras[camera] = with_turn(&rig.cameras[camera], &turn);
-        let fitting = pairs.iter().zip(matched).map(|(&(i, k), found)| fitting(&rig.cameras[i], &rig.cameras[k], found)).sum::<usize>();
-        (camera, turn.norm().to_degrees(), fitting, explains(&rig, pairs, matched))
+        let mut turned = rig.clone();
+        turned.cameras[camera] = with_turn(&rig.cameras[camera], &turn);
+        explains(&turned, pairs, matched).then(|| (camera, turn.norm().to_degrees(), misfit(&turned, pairs, matched)))
     };
-    let mut tried: Vec<_> = (0..rig.cameras.len()).map(try_camera).filter(|t| t.3).collect();
-    tried.sort_by_key(|t| std::cmp::Reverse(t.2));
-    let best = tried.first()?;
-    let cameras = tried.iter().filter(|t| t.2 as f64 > ALIKE * best.2 as f64).map(|t| t.0).collect();
-    Some(Fault::Turned { cameras, angle_deg: best.1 })
+    let mut tried: Vec<_> = (0..rig.cameras.len()).filter_map(try_camera).collect();
+    tried.sort_by(|a, b| a.2.total_cmp(&b.2));
+    let (_, angle_deg, least) = *tried.first().filter(|t| t.2 < BETTER * misfit(rig, pairs, matched))?;
+    Some(Fault::Turned { cameras: tried.iter().filter(|t| t.2 < ALIKE * least).map(|t| t.0).collect(), angle_deg })
+}
+
+/// Σ ρ of all matches.
+fn misfit(rig: &Rig, pairs: &[(usize, usize)], matched: &[Pairs]) -> f64 {
+    let of_pair = |(&(i, k), found): (&(usize, usize), &Pairs)| {
+        let (a, b) = (&rig.cameras[i], &rig.cameras[k]);
+        let Some(baseline) = (b.centre() - a.centre()).try_normalize(1e-12) else { return 0.0 };
+        let one = |(pixel_a, pixel_b): &(Point2<f64>, Point2<f64>)| {
+            let (Some(ray_a), Some(ray_b)) = (a.ray(pixel_a), b.ray(pixel_b)) else { return 1.0 };
+            let square = (a.matrix[(0, 0)] * plane_distance(&baseline, &ray_a, &ray_b) / SCATTER_PX).powi(2);
+            square / (1.0 + square)
+        };
+        found.iter().map(one).sum::<f64>()
+    };
+    pairs.iter().zip(matched).map(of_pair).sum()
 }
 
 /// A camera turned about its centre by the vector `turn` of its own frame.
@@ -300,7 +317,7 @@ fn best_turn(rig: &Rig, camera: usize, pairs: &[(usize, usize)], matched: &[Pair
         }
         let Some(step) = normal.cholesky().map(|c| c.solve(&right)) else { break };
         turn = rotation::log(&(rotation::exp(&step) * rotation::exp(&turn)));
-        width_px = (0.8 * width_px).max(FITS_PX);
+        width_px = (0.8 * width_px).max(SCATTER_PX);
     }
     turn
 }

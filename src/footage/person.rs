@@ -71,7 +71,8 @@ pub fn measure(rig: &Rig, pairs: &[PairMatches], masks: &[Vec<GrayImage>]) -> Op
         outlines.extend(rig.cameras.iter().zip(masks).filter_map(|(camera, mask)| outline(camera, mask, &place, &picture_up, &up)));
     }
     let median = |value: &dyn Fn(&Outline) -> f64| quantile(outlines.iter().map(value).collect(), 0.5);
-    let along = Vector3::from_iterator((0..3).filter_map(|k| median(&|o| o.head[k]))).try_normalize(1e-6)?;
+    let part = |k: usize| median(&|o: &Outline| o.head[k]);
+    let along = Vector3::new(part(0)?, part(1)?, part(2)?).try_normalize(1e-6)?;
     let head = if median(&|o| o.widening.ln())? < -WIDER.ln() { -along } else { along };
     Some(Person { height_m: median(&|o| o.height_m)?, feet_m: median(&|o| o.feet_m)?, head, picture_up })
 }
