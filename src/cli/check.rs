@@ -69,9 +69,16 @@ impl Findings {
     /// An error where no tracking can come of the session.
     pub fn refuse(&self, session: &Session) -> Result<()> {
         let rig = &session.rig;
-        let calibration = || self.fault.as_ref().filter(|_| self.unusable()).map(|f| fault_text(rig, f));
+        let unsharp = || self.seen.blurred(rig).filter(|_| matches!(self.fault, Some(Fault::NothingInCommon { .. } | Fault::Whole)));
+        let misfit = || self.fault.as_ref().filter(|_| self.unusable()).map(|f| fault_text(rig, f));
         let doubt = || self.person.and_then(|p| p.doubt(rig)).map(|d| doubt_text(rig, &d));
-        let refusal = self.seen.refusal(rig).or_else(calibration).or_else(|| judge_offsets(rig, &self.offsets, session.fps).0).or_else(doubt);
+        let refusal = self
+            .seen
+            .refusal(rig)
+            .or_else(unsharp)
+            .or_else(misfit)
+            .or_else(|| judge_offsets(rig, &self.offsets, session.fps).0)
+            .or_else(doubt);
         match refusal {
             Some(refusal) => bail!("{}: {refusal}", session.folder.display()),
             None => Ok(()),
@@ -214,14 +221,20 @@ fn fault_text(rig: &Rig, fault: &Fault) -> String {
         }
         Fault::Changed { camera, change } => {
             let whose = camera.map_or("all cameras".into(), name);
-            format!("the pictures of {whose} are {} against the calibration; bring them back to how they were calibrated", change_text(*change))
+            format!(
+                "the pictures of {whose} are {} against the calibration; bring them back to how they were calibrated",
+                change_text(*change)
+            )
         }
         Fault::Turned { cameras, angle_deg } => {
             let names = cameras.iter().map(|&k| name(k)).collect::<Vec<_>>().join(" or ");
             let other = if *angle_deg > 1.0 { ", or take the Calib.toml of this rig" } else { "" };
             format!("{names} is turned by {angle_deg:.1} degrees (or moved) against the calibration: calibrate again{other}")
         }
-        Fault::Whole => "the calibration does not fit these pictures, and no single camera explains it; is this Calib.toml of this rig? Calibrate again".into(),
+        Fault::Whole => {
+            "the calibration does not fit these pictures, and no single camera explains it; is this Calib.toml of this rig? Calibrate again"
+                .into()
+        }
         Fault::NothingInCommon { first, second, matches } => format!(
             "{} and {} have almost nothing in common ({matches} features) to judge the calibration by; do both see the stage sharply, and has it texture?",
             name(*first),
@@ -248,7 +261,9 @@ fn doubt_text(rig: &Rig, doubt: &Doubt) -> String {
         ),
         Doubt::Up { axis, positive: true } if (*axis == 1 && rig.up == Up::Z) || (*axis == 2 && rig.up == Up::Y) => {
             let axis = ["x", "y", "z"][*axis];
-            format!("the person stands along the world's {axis} axis but {said} is up by Calib.toml; write up = \"{axis}\" under [metadata] there")
+            format!(
+                "the person stands along the world's {axis} axis but {said} is up by Calib.toml; write up = \"{axis}\" under [metadata] there"
+            )
         }
         Doubt::Up { axis, positive } => {
             let (sign, axis) = (if *positive { "+" } else { "-" }, ["x", "y", "z"][*axis]);

@@ -32,7 +32,7 @@ const STILL_OVERLAP: f64 = 0.9;
 /// Standard deviation of grey levels below which a picture shows nothing.
 const EVEN_GREY: f64 = 3.0;
 /// A camera with less than this share of the others' relative detail is out of focus.
-const BLUR_SHARE: f64 = 0.25;
+const BLUR_SHARE: f64 = 0.5;
 /// Cameras further apart in time are refused; what is left after whole frames are cut is less.
 const LARGEST_OFFSET: f64 = 0.5;
 /// Smaller offsets do no harm: 3 ms at 30 frames per second move a foot by a centimetre.
@@ -175,11 +175,8 @@ impl Survey {
                     camera.name
                 ));
             }
-            if facts.contrast_grey >= EVEN_GREY && facts.detail < BLUR_SHARE * self.usual_detail() {
-                let share = 100.0 * facts.detail / self.usual_detail();
-                warnings.push(format!("{}: shows {share:.0} % of the detail that the other cameras see; focus its lens", camera.name));
-            }
         }
+        warnings.extend(self.blurred(rig));
         if all > 1 && self.somebody_in_view() && self.cameras.iter().all(|c| c.least_overlap > STILL_OVERLAP) {
             warnings.push("nothing moves in these pictures; a motion cannot be measured from them".into());
         }
@@ -194,6 +191,15 @@ impl Survey {
             "{}: shows nothing but an even grey (contrast of {grey:.1} grey levels); take off the lens cap, switch on the light, or focus",
             camera.name
         ))
+    }
+
+    /// The first camera that is out of focus, with the remedy.
+    pub fn blurred(&self, rig: &Rig) -> Option<String> {
+        let usual = self.usual_detail();
+        let blurred = |facts: &CameraFacts| facts.contrast_grey >= EVEN_GREY && facts.detail < BLUR_SHARE * usual;
+        let (camera, facts) = rig.cameras.iter().zip(&self.cameras).find(|(_, facts)| blurred(facts))?;
+        let share = 100.0 * facts.detail / usual;
+        Some(format!("{}: shows {share:.0} % of the detail that the other cameras see; focus its lens", camera.name))
     }
 
     /// The upper median of the cameras' detail.
@@ -253,14 +259,16 @@ fn remedy(rig: &Rig, known: &[(usize, Offset)]) -> String {
     let mut cuts: BTreeMap<usize, Vec<&str>> = BTreeMap::new();
     known.iter().for_each(|(k, o)| cuts.entry((latest - o.frames).round() as usize).or_default().push(&rig.cameras[*k].name));
     let frames = |count: usize| if count == 1 { "frame".into() } else { format!("{count} frames") };
-    let texts = cuts.iter().filter(|(count, _)| **count > 0).map(|(&count, names)| format!("the first {} of {}", frames(count), names.join(" and ")));
+    let texts = cuts
+        .iter()
+        .filter(|(count, _)| **count > 0)
+        .map(|(&count, names)| format!("the first {} of {}", frames(count), names.join(" and ")));
     format!("cut {} and number all from the same again, or start the cameras with one trigger", texts.collect::<Vec<_>>().join(" and "))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::footage::epipolar::PairResidual;
     use crate::rig::{Camera, Up};
     use nalgebra::{Matrix3, Rotation3, Vector3};
     use std::convert::Infallible;
@@ -289,10 +297,9 @@ mod tests {
     }
 
     fn look(images: Vec<[GrayImage; 2]>) -> Survey {
-        let count = images.len();
         let frames =
             images.into_iter().enumerate().map(|(number, i)| Ok::<_, Infallible>(FrameSet { number, time_s: 0.0, images: i.into() }));
-        survey(frames, count, &[stage(), stage()]).unwrap()
+        survey(frames, &rig(), &[stage(), stage()]).unwrap()
     }
 
     #[test]
@@ -300,7 +307,7 @@ mod tests {
         let survey = look((0..20).map(|i| [with_square(10 + 3 * i), stage()]).collect());
         assert!((survey.cameras[0].foreground_share - 600.0 / 10800.0).abs() < 0.006, "{:?}", survey.cameras[0]);
         assert_eq!((survey.frames, survey.cameras[0].empty_frames, survey.cameras[1].empty_frames), (20, 0, 20));
-        assert_eq!(survey.samples.iter().map(|s| s.0.number).collect::<Vec<_>>(), [0, 4, 9, 14, 19]);
+        assert!(survey.together.is_empty());
         assert_eq!(survey.warnings(&rig()), ["cam_01: nobody is in view in 20 of 20 frames"]);
     }
 
@@ -314,12 +321,41 @@ mod tests {
     }
 
     #[test]
-    fn residuals_tell_calibration_from_synchronization() {
-        let residual = |matches, px| vec![PairResidual { first: 0, second: 1, matches, median_px: Some(px) }];
-        let said = |stage: Vec<PairResidual>, person: Vec<PairResidual>| residual_warnings(&rig(), &stage, &person).join(" ");
-        assert!(said(residual(99, 2.0), residual(99, 2.0)).contains("calibration does not fit"));
-        assert!(said(residual(99, 0.3), residual(99, 2.0)).contains("not synchronous"));
-        assert!(said(residual(3, 9.0), residual(99, 0.3)).contains("too few common corners (3)"));
-        assert_eq!(said(residual(99, 0.3), residual(9, 5.0)), "");
+    fn caps_and_blur_are_named_and_exposure_is_not() {
+        let frames = || std::iter::empty::<Result<FrameSet, Infallible>>();
+        let looked = |other: GrayImage| survey(frames(), &rig(), &[stage(), other]).unwrap();
+        let even = looked(GrayImage::from_fn(120, 90, |x, y| image::Luma([4 + ((7 * x + 3 * y) % 3) as u8])));
+        let refusal = even.refusal(&rig()).unwrap();
+        assert!(refusal.starts_with("cam_01: shows nothing but an even grey (contrast of 0.8 grey levels)"), "{refusal}");
+        let slope = looked(GrayImage::from_fn(120, 90, |x, y| image::Luma([(60 + x + (x + y) % 2) as u8])));
+        let blurred = slope.blurred(&rig()).unwrap();
+        assert!(slope.refusal(&rig()).is_none() && blurred.contains("of the detail that the other cameras see; focus"), "{blurred}");
+        let brighter = looked(GrayImage::from_fn(120, 90, |x, y| image::Luma([(f64::from(stage().get_pixel(x, y).0[0]) * 1.3) as u8])));
+        assert_eq!((brighter.refusal(&rig()), brighter.blurred(&rig())), (None, None));
+    }
+
+    #[test]
+    fn residuals_are_judged_by_matches_and_distance() {
+        let fit = |matches, px| Fit::of(&PairResidual { first: 0, second: 1, matches, median_px: px });
+        assert_eq!([fit(99, Some(0.3)), fit(99, Some(0.9)), fit(99, Some(2.5))], [Fit::Good, Fit::Loose, Fit::Unusable]);
+        assert_eq!([fit(9, Some(0.1)), fit(0, None)], [Fit::Unknown, Fit::Unknown]);
+    }
+
+    #[test]
+    fn offsets_are_refused_above_half_a_frame_and_only_where_they_are_certain() {
+        let judge = |frames: f64, sigma: f64| {
+            let offsets = [Offset { frames: 0.0, sigma: 0.0 }, Offset { frames, sigma }].map(Some);
+            let (refusal, warnings) = judge_offsets(&rig(), &offsets, 25.0);
+            (refusal.unwrap_or_default(), warnings.join(" "))
+        };
+        let late = judge(2.1, 0.05).0;
+        assert!(late.contains("cam_01: its pictures were taken 2.10 +- 0.05 frames (84 ms) after"), "{late}");
+        assert!(late.contains("cut the first 2 frames of cam_00 and number"), "{late}");
+        assert!(judge(-0.7, 0.1).0.contains("before those of the same number; cut the first frame of cam_01"));
+        assert_eq!(judge(0.9, 0.4), Default::default());
+        assert!(judge(0.3, 0.02).1.contains("use a trigger") && judge(0.3, 0.02).0.is_empty());
+        assert_eq!(judge(0.05, 0.001), Default::default());
+        let silent = judge_offsets(&rig(), &[Some(Offset { frames: 0.0, sigma: 0.0 }), None], 25.0);
+        assert!(silent.0.is_none() && silent.1[0].starts_with("cam_01: the motion does not tell"));
     }
 }

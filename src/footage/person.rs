@@ -44,9 +44,15 @@ pub struct Person {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Doubt {
     /// The person would be `height_m` tall; translations times `scale` would make an adult of them.
-    Units { height_m: f64, scale: f64 },
+    Units {
+        height_m: f64,
+        scale: f64,
+    },
     /// The person stands along this axis of the world (0 to 2, and its sign), which is not the rig's up.
-    Up { axis: usize, positive: bool },
+    Up {
+        axis: usize,
+        positive: bool,
+    },
     UpsideDown,
 }
 

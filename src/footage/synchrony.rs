@@ -107,9 +107,8 @@ impl Signatures {
 
     /// The offsets of all pairs that the signatures tell.
     pub fn offsets(&self) -> Vec<PairOffset> {
-        let tell = |(pair, p): (usize, &EpipolarPlanes)| {
-            Some(PairOffset { first: p.first, second: p.second, offset: self.pair_offset(pair)? })
-        };
+        let tell =
+            |(pair, p): (usize, &EpipolarPlanes)| Some(PairOffset { first: p.first, second: p.second, offset: self.pair_offset(pair)? });
         self.planes.iter().enumerate().filter_map(tell).collect()
     }
 
@@ -314,4 +313,96 @@ pub fn better(coarse: &[PairOffset], fine: &[PairOffset]) -> Vec<PairOffset> {
     let chosen = |p: &PairOffset| of(fine, p).filter(|f| f.offset.sigma < p.offset.sigma).unwrap_or(*p);
     let only_fine = fine.iter().filter(|f| of(coarse, f).is_none()).copied();
     coarse.iter().map(chosen).chain(only_fine).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rig::Up;
+    use nalgebra::{Matrix3, Rotation3};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn pair(first: usize, second: usize, frames: f64, sigma: f64) -> PairOffset {
+        PairOffset { first, second, offset: Offset { frames, sigma } }
+    }
+
+    #[test]
+    fn offsets_of_pairs_become_those_of_cameras() {
+        let found = camera_offsets(4, &[pair(0, 1, 2.0, 0.1), pair(1, 2, -2.1, 0.1), pair(0, 2, -0.1, 1e9)]);
+        let expected = [0.0, 2.0, -0.1];
+        for (found, expected) in found.iter().zip(expected) {
+            assert!((found.unwrap().frames - expected).abs() < 1e-3, "{found:?}");
+        }
+        assert!(found[3].is_none());
+        // Variances add along the chain from camera 0, the one in the middle.
+        assert!((found[2].unwrap().sigma - 0.02f64.sqrt()).abs() < 1e-3 && found[0].unwrap().sigma < 1e-6);
+        let torn = camera_offsets(3, &[pair(0, 1, 0.0, 0.01), pair(1, 2, 0.0, 0.01), pair(0, 2, 0.3, 0.01)]);
+        assert!(torn.iter().any(|o| o.is_some_and(|o| o.sigma > 0.1)), "{torn:?}");
+    }
+
+    #[test]
+    fn the_line_bears_outliers_and_knows_its_error() {
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        let mut normal = || (0..12).map(|_| random.random::<f64>() - 0.5).sum::<f64>();
+        let mut standardised = Vec::new();
+        for _ in 0..60 {
+            let crossings: Vec<Crossing> = (0..160)
+                .map(|k| {
+                    let (speed_px, wild) = (3.0 * normal(), if k % 9 == 0 { 6.0 * normal() } else { 0.0 });
+                    Crossing { instant: k / 20, speed_px, distance_px: 0.37 * speed_px + 0.05 + 0.4 * normal() + wild }
+                })
+                .collect();
+            let found = line(&crossings).unwrap();
+            assert!((found.frames - 0.37).abs() < 0.08, "{found:?}");
+            standardised.push((found.frames - 0.37) / found.sigma);
+        }
+        let rms = (standardised.iter().map(|z| z * z).sum::<f64>() / 60.0).sqrt();
+        assert!((0.7..1.4).contains(&rms), "{rms}");
+        assert!(line(&[]).is_none());
+    }
+
+    /// Two cameras side by side that look along z.
+    fn rig() -> Rig {
+        let camera = |x: f64| Camera {
+            name: format!("{x}"),
+            size_px: [160, 120],
+            matrix: Matrix3::new(150.0, 0.0, 80.0, 0.0, 150.0, 60.0, 0.0, 0.0, 1.0),
+            distortion: [0.0; 5],
+            camera_from_world: Rotation3::identity(),
+            translation: Vector3::new(-x, 0.0, 0.0),
+        };
+        Rig { cameras: vec![camera(0.0), camera(0.3)], up: Up::Y }
+    }
+
+    #[test]
+    fn signatures_tell_whole_frames() {
+        let mut signatures = Signatures::new(&rig());
+        // A bar that jumps; the second camera sees it 15 px to the left and took the same moment 3 frames before.
+        let mask = |frame: i64, left: u32| {
+            let top = (30.0 + 14.0 * (0.7 * frame as f64).sin() + 0.8 * frame as f64) as u32;
+            GrayImage::from_fn(160, 120, |x, y| {
+                image::Luma([if (left..left + 12).contains(&x) && (top..top + 40).contains(&y) { 255 } else { 0 }])
+            })
+        };
+        for frame in 0..30 {
+            let signature = signatures.signature(&[mask(frame, 70), mask(frame + 3, 55)]);
+            signatures.push(frame as usize, signature);
+        }
+        let found = signatures.offsets();
+        assert!((found[0].offset.frames - 3.0).abs() < 0.1 && found[0].offset.sigma < 0.1, "{found:?}");
+        assert!(Signatures::new(&rig()).offsets().is_empty());
+    }
+
+    #[test]
+    fn corners_are_tracked() {
+        let wave = |x: f64, y: f64| (120.0 + 50.0 * (0.5 * x + 0.1 * y).sin() + 50.0 * (0.45 * y - 0.15 * x).cos()) as u8;
+        let picture = |t: f64| GrayImage::from_fn(160, 120, |x, y| image::Luma([wave(f64::from(x) - 3.3 * t, f64::from(y) + 1.7 * t)]));
+        let points = [Point2::new(80.0, 60.0), Point2::new(50.0, 70.0)];
+        for v in velocities([&picture(-1.0), &picture(0.0), &picture(1.0)], &points).unwrap() {
+            assert!((v.unwrap() - Vector2::new(3.3, -1.7)).norm() < 0.05, "{v:?}");
+        }
+        let still = velocities([&picture(0.0), &picture(0.0), &picture(1.0)], &points).unwrap();
+        assert!(still.iter().all(Option::is_none), "{still:?}");
+    }
 }
