@@ -20,7 +20,7 @@ use opencv::features2d::{BFMatcher, SIFT};
 use opencv::prelude::*;
 
 /// Features per picture; more take longer and tell no more.
-const FEATURES: i32 = 1000;
+const FEATURES: i32 = 700;
 /// A match is unique when the second best is this much worse (Lowe).
 const UNIQUE: f32 = 0.75;
 /// τ of (1); SIFT's places err by some tenths.
@@ -215,24 +215,39 @@ fn changed(
         }
     }
     for camera in 0..images.len() {
-        let mirrored = features(&imageops::flip_horizontal(&images[camera]))?;
-        let width = f64::from(images[camera].width()) - 1.0;
-        let mirrored = Features { points: mirrored.points.iter().map(|p| Point2::new(width - p.x, p.y)).collect(), ..mirrored };
+        let mirrored = mirrored_matches(camera, images, plain, pairs, matched)?;
         for change in changes(&images[camera]) {
-            let own = if matches!(change, Change::Rotated(_)) { &plain[camera] } else { &mirrored };
-            let mut undone = Vec::new();
-            for (&(i, k), found) in pairs.iter().zip(matched) {
-                let (a, b) = (if i == camera { own } else { &plain[i] }, if k == camera { own } else { &plain[k] });
-                let found = if i == camera || k == camera { &common(a, b)? } else { found };
-                let of = |c: usize| (c == camera).then(|| &images[c]);
-                undone.push(undo_pairs(found, [of(i), of(k)], change));
-            }
-            if explains(rig, pairs, &undone) {
+            let matched = if matches!(change, Change::Rotated(_)) { matched } else { &mirrored };
+            let of = |c: usize| (c == camera).then(|| &images[c]);
+            let undone = pairs.iter().zip(matched).map(|(&(i, k), found)| undo_pairs(found, [of(i), of(k)], change));
+            if explains(rig, pairs, &undone.collect::<Vec<_>>()) {
                 return Ok(Some(Fault::Changed { camera: Some(camera), change }));
             }
         }
     }
     Ok(None)
+}
+
+/// The matches with the features of one camera's picture sought in its mirror image, at their places in the picture.
+fn mirrored_matches(
+    camera: usize,
+    images: &[GrayImage],
+    plain: &[Features],
+    pairs: &[(usize, usize)],
+    matched: &[Pairs],
+) -> Result<Vec<Pairs>, MisfitError> {
+    let mut own = features(&imageops::flip_horizontal(&images[camera]))?;
+    let right = f64::from(images[camera].width()) - 1.0;
+    own.points.iter_mut().for_each(|p| p.x = right - p.x);
+    let mut mirrored = Vec::new();
+    for (&(i, k), found) in pairs.iter().zip(matched) {
+        mirrored.push(match (i == camera, k == camera) {
+            (true, _) => common(&own, &plain[k])?,
+            (_, true) => common(&plain[i], &own)?,
+            _ => found.clone(),
+        });
+    }
+    Ok(mirrored)
 }
 
 /// The changes that keep a picture's size.
