@@ -1,4 +1,5 @@
 //! One file per subcommand: load, call the library, save, report.
+mod bench;
 mod check;
 mod clouds;
 mod demo;
@@ -43,6 +44,9 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
+    /// Accuracy and time beside OpenCV's, against known truth
+    #[command(subcommand)]
+    Bench(bench::BenchCommand),
     /// Phantom footage of a motion file before a rig, with its truth
     Render(render::RenderArgs),
 }
@@ -70,6 +74,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),
         Command::Render(args) => render::run(&args),
+        Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
     }

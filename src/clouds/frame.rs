@@ -3,7 +3,7 @@
 use super::cloud::Cloud;
 use super::correlate::Region;
 use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
-use super::stereo::{PreparedView, StereoOptions, ViewDisparity, match_views};
+use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
 use super::{tidy, triangulate};
 use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
@@ -29,9 +29,7 @@ pub struct CloudOptions {
 
 impl Default for CloudOptions {
     fn default() -> Self {
-        // The stage test removes what a low bar for uniqueness lets in; bare skin needs the low bar.
-        let stereo = StereoOptions { uniqueness: 0.1, ..StereoOptions::default() };
-        Self { nearest_m: 1.2, farthest_m: 12.0, voxel_m: None, stereo, stage: StageOptions::default() }
+        Self { nearest_m: 1.2, farthest_m: 12.0, voxel_m: None, stereo: StereoOptions::default(), stage: StageOptions::default() }
     }
 }
 
@@ -58,6 +56,10 @@ pub struct FrameCloud {
     pub masks: Vec<Option<GrayImage>>,
     /// The person's disparities in the reference view, px; NaN elsewhere.
     pub disparity: Plane,
+    /// All validated disparities of the searched part of the reference view, px, the person's or not; NaN elsewhere.
+    pub matched: Plane,
+    /// Pixels of the reference view that changed against the stage, 0/255; all without a stage.
+    pub changed: GrayImage,
 }
 
 /// A rig made ready for footage: its rectified groups, and the empty stage as each of them sees it.
@@ -173,7 +175,10 @@ fn everything(
     let regions = vec![whole(rectification); planes.len()];
     let found = search(rectification, planes, &regions, range, options);
     let disparity = found[0].1.disparity.clone();
-    Ok(FrameCloud { cloud: points(rectification, &found[0], &disparity, options), masks: vec![None; cameras], disparity })
+    let cloud = points(rectification, &found[0], &disparity, options);
+    let [width, height] = rectification.size_px;
+    let changed = GrayImage::from_pixel(width, height, Luma([255]));
+    Ok(FrameCloud { cloud, masks: vec![None; cameras], matched: disparity.clone(), disparity, changed })
 }
 
 fn person(
@@ -195,7 +200,8 @@ fn person(
     for (k, view) in rectification.views.iter().enumerate() {
         masks[view.index] = Some(rectification.unwarp(k, &persons[k]));
     }
-    FrameCloud { cloud: points(rectification, &found[0], &disparity, options), masks, disparity }
+    let cloud = points(rectification, &found[0], &disparity, options);
+    FrameCloud { cloud, masks, disparity, matched: found[0].1.disparity.clone(), changed: changes[0].changed.clone() }
 }
 
 fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Vec<&'a GrayImage>, CloudError> {
@@ -223,8 +229,8 @@ fn search(
     regions: &[Region],
     range: [usize; 2],
     options: &CloudOptions,
-) -> Vec<(PreparedView, ViewDisparity)> {
-    let prepared: Vec<PreparedView> = planes.into_iter().zip(&rectification.views).map(|(p, v)| PreparedView::new(p, v.step)).collect();
+) -> Vec<(StereoView, ViewDisparity)> {
+    let prepared: Vec<StereoView> = planes.into_iter().zip(&rectification.views).map(|(p, v)| StereoView { plane: p, step: v.step }).collect();
     let found = match_views(&prepared, regions, range, &options.stereo);
     prepared.into_iter().zip(found).collect()
 }
@@ -241,18 +247,20 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
         masks[view.index] = Some(GrayImage::new(width, height));
     }
     let [width, height] = rectification.size_px;
-    FrameCloud { cloud: Cloud::default(), masks, disparity: Plane::from_pixel(width, height, Luma([f32::NAN])) }
+    let nothing = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    FrameCloud { cloud: Cloud::default(), masks, disparity: nothing.clone(), matched: nothing, changed: GrayImage::new(width, height) }
 }
 
-fn points(rectification: &Rectification, reference: &(PreparedView, ViewDisparity), disparity: &Plane, options: &CloudOptions) -> Cloud {
+fn points(rectification: &Rectification, reference: &(StereoView, ViewDisparity), disparity: &Plane, options: &CloudOptions) -> Cloud {
     let (prepared, found) = reference;
     let all_views = rectification.views.len() as f32 - 1.0;
-    let (width, region) = (disparity.width() as usize, found.matches.region);
+    let (matches, width) = (&found.matches, disparity.width() as usize);
     let mut confidence = Plane::new(disparity.width(), disparity.height());
-    for (j, (cost, rival)) in found.matches.cost.iter().zip(&found.matches.rival).enumerate() {
+    for (j, (cost, rival)) in matches.cost.iter().zip(&matches.rival).enumerate() {
+        let region = matches.region;
         let i = (region.y[0] + j / region.width()) * width + region.x[0] + j % region.width();
         let distinct = 1.0 - f32::from(cost[1]) / f32::from((*rival).max(1));
-        confidence.as_mut()[i] = distinct.clamp(0.0, 1.0) * found.confirmed[i].count_ones() as f32 / all_views;
+        confidence.as_mut()[i] = distinct.clamp(0.0, 1.0) * found.confirmed[j].count_ones() as f32 / all_views;
     }
     let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, disparity, &confidence, &prepared.plane));
     match options.voxel_m {

@@ -3,6 +3,7 @@
 pub mod cloud;
 pub mod correlate;
 pub mod frame;
+mod lanes;
 pub mod prefilter;
 pub mod stage;
 pub mod stereo;
