@@ -625,7 +625,11 @@ mod tests {
             ((1.0 - (x - u).abs()) * (1.0 - (y - v).abs()), read(image, u as i64, v as i64))
         });
         let counts = |weight: f64| weight > 1e-9;
-        if taps.iter().any(|(weight, value)| counts(*weight) && *value == 0.0) { 0.0 } else { taps.iter().map(|(w, v)| w * v).sum::<f64>().round() }
+        if taps.iter().any(|(weight, value)| counts(*weight) && *value == 0.0) {
+            0.0
+        } else {
+            taps.iter().map(|(w, v)| w * v).sum::<f64>().round()
+        }
     }
 
     /// Equations (1) and (2), grey levels.
@@ -743,12 +747,8 @@ mod tests {
         // The other view is the reference moved by 20 px; the band of 20 px without a partner stays expensive.
         let a = noise(4);
         let moved = GrayImage::from_fn(61, 40, |x, y| if x + 20 < 61 { *a.get_pixel(x + 20, y) } else { Luma([0]) });
-        let found = correlate(
-            &[Pair { reference: a, other: moved, step: Vector2::new(-1.0, 0.0) }],
-            Region { x: [0, 61], y: [0, 40] },
-            0..32,
-            2,
-        );
+        let found =
+            correlate(&[Pair { reference: a, other: moved, step: Vector2::new(-1.0, 0.0) }], Region { x: [0, 61], y: [0, 40] }, 0..32, 2);
         let column = |x: usize| (5..35).map(move |y| y * 61 + x);
         assert!((30..61).flat_map(column).all(|i| found.best[i] == 20 || found.best[i] == NO_MATCH));
         assert!((0..12).flat_map(column).all(|i| found.cost[i][1] > 60));

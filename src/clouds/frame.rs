@@ -4,6 +4,7 @@ use super::cloud::Cloud;
 use super::correlate::Region;
 use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
 use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
+use super::subpixel::{self, Refined};
 use super::{tidy, triangulate};
 use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
@@ -174,8 +175,9 @@ fn everything(
 ) -> Result<FrameCloud, CloudError> {
     let regions = vec![whole(rectification); planes.len()];
     let found = search(rectification, planes, &regions, range, options);
-    let disparity = found[0].1.disparity.clone();
-    let cloud = points(rectification, &found[0], &disparity, options);
+    let Refined { disparity, sigma_px } = refine(&found, found[0].1.disparity.clone());
+    let refined = Refined { disparity: disparity.clone(), sigma_px };
+    let cloud = points(rectification, &found[0].0, &refined, options);
     let [width, height] = rectification.size_px;
     let changed = GrayImage::from_pixel(width, height, Luma([255]));
     Ok(FrameCloud { cloud, masks: vec![None; cameras], matched: disparity.clone(), disparity, changed })
@@ -195,13 +197,14 @@ fn person(
     let found = search(rectification, planes, &regions, range, options);
     let outline = |k: usize| person_mask(rectification, k, &changes, &stage.views[k], &found[k].1, &options.stage);
     let persons: Vec<GrayImage> = (0..found.len()).map(outline).collect();
-    let disparity = inside(&found[0].1.disparity, &persons[0]);
+    let refined = refine(&found, inside(&found[0].1.disparity, &persons[0]));
     let mut masks = vec![None; cameras];
     for (k, view) in rectification.views.iter().enumerate() {
         masks[view.index] = Some(rectification.unwarp(k, &persons[k]));
     }
-    let cloud = points(rectification, &found[0], &disparity, options);
-    FrameCloud { cloud, masks, disparity, matched: found[0].1.disparity.clone(), changed: changes[0].changed.clone() }
+    let cloud = points(rectification, &found[0].0, &refined, options);
+    let matched = either(&refined.disparity, &found[0].1.disparity);
+    FrameCloud { cloud, masks, disparity: refined.disparity, matched, changed: changes[0].changed.clone() }
 }
 
 fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Vec<&'a GrayImage>, CloudError> {
@@ -230,7 +233,8 @@ fn search(
     range: [usize; 2],
     options: &CloudOptions,
 ) -> Vec<(StereoView, ViewDisparity)> {
-    let prepared: Vec<StereoView> = planes.into_iter().zip(&rectification.views).map(|(p, v)| StereoView { plane: p, step: v.step }).collect();
+    let prepared: Vec<StereoView> =
+        planes.into_iter().zip(&rectification.views).map(|(p, v)| StereoView { plane: p, step: v.step }).collect();
     let found = match_views(&prepared, regions, range, &options.stereo);
     prepared.into_iter().zip(found).collect()
 }
@@ -238,6 +242,12 @@ fn search(
 fn inside(disparity: &Plane, mask: &GrayImage) -> Plane {
     let values = disparity.iter().zip(mask.iter()).map(|(&d, &m)| if m == 0 { f32::NAN } else { d }).collect();
     ImageBuffer::from_raw(disparity.width(), disparity.height(), values).expect("same size")
+}
+
+/// The first plane's values, the second's where it has none.
+fn either(first: &Plane, second: &Plane) -> Plane {
+    let values = first.iter().zip(second.iter()).map(|(a, b)| if a.is_nan() { *b } else { *a }).collect();
+    ImageBuffer::from_raw(first.width(), first.height(), values).expect("same size")
 }
 
 fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
@@ -251,18 +261,15 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
     FrameCloud { cloud: Cloud::default(), masks, disparity: nothing.clone(), matched: nothing, changed: GrayImage::new(width, height) }
 }
 
-fn points(rectification: &Rectification, reference: &(StereoView, ViewDisparity), disparity: &Plane, options: &CloudOptions) -> Cloud {
-    let (prepared, found) = reference;
-    let all_views = rectification.views.len() as f32 - 1.0;
-    let (matches, width) = (&found.matches, disparity.width() as usize);
-    let mut confidence = Plane::new(disparity.width(), disparity.height());
-    for (j, (cost, rival)) in matches.cost.iter().zip(&matches.rival).enumerate() {
-        let region = matches.region;
-        let i = (region.y[0] + j / region.width()) * width + region.x[0] + j % region.width();
-        let distinct = 1.0 - f32::from(cost[1]) / f32::from((*rival).max(1));
-        confidence.as_mut()[i] = distinct.clamp(0.0, 1.0) * found.confirmed[j].count_ones() as f32 / all_views;
-    }
-    let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, disparity, &confidence, &prepared.plane));
+/// The reference view's disparities refined on the grey values of all views.
+fn refine(found: &[(StereoView, ViewDisparity)], disparity: Plane) -> Refined {
+    let (reference, matched) = &found[0];
+    let others: Vec<_> = found[1..].iter().map(|(view, _)| (&view.plane, view.step - reference.step)).collect();
+    subpixel::refine(&reference.plane, &others, &disparity, &matched.confirmed)
+}
+
+fn points(rectification: &Rectification, reference: &StereoView, refined: &Refined, options: &CloudOptions) -> Cloud {
+    let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, refined, &reference.plane));
     match options.voxel_m {
         Some(side) => tidy::thin(cloud, side),
         None => cloud,
@@ -316,7 +323,7 @@ mod tests {
                 name: format!("cam_0{k}"),
                 size_px: [640, 480],
                 matrix: nalgebra::Matrix3::from_row_slice(&rows),
-                distortion: [d[0], d[1], d[2], d[3], 0.0],
+                lens: crate::rig::Lens::brown_conrady(&d).unwrap(),
                 camera_from_world: nalgebra::Rotation3::new(nalgebra::Vector3::from_column_slice(&numbers(&t["rotation"]))),
                 translation: nalgebra::Vector3::from_column_slice(&numbers(&t["translation"])),
             }

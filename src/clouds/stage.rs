@@ -9,7 +9,7 @@
 
 use super::correlate::Region;
 use super::prefilter::blur;
-use super::stereo::{StereoView, StereoOptions, ViewDisparity, match_views};
+use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
 use crate::footage::regions;
 use crate::rig::rectify::{Plane, Rectification};
 use image::{GrayImage, Luma};

@@ -1,8 +1,8 @@
 //! Dense disparities of two or three rectified views, seen from one of them.
 
 use super::correlate::{Matches, Pair, Region, correlate};
-use super::subpixel::equiangular;
 use super::prefilter;
+use super::subpixel::equiangular;
 use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
 use image::Luma;
@@ -45,7 +45,7 @@ pub struct StereoView {
 pub struct ViewDisparity {
     /// Validated sub-pixel disparities, px; NaN elsewhere.
     pub disparity: Plane,
-    /// Bits of the other views (in order, this one left out) that confirm a pixel of the region.
+    /// Bits of the other views (in order, this one left out) that confirm a pixel.
     pub confirmed: Vec<u8>,
     pub matches: Matches,
 }
@@ -76,12 +76,12 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(&matches, pair)).collect();
     let (width, height) = here.plane.dimensions();
     let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
-    let mut confirmed = vec![0; matches.best.len()];
+    let mut confirmed = vec![0; (width * height) as usize];
     let (tolerance, px) = ((f64::from(options.consistency_px) * per_px) as u16, (1.0 / per_px) as f32);
-    let planes = disparity.par_chunks_exact_mut(width.max(1) as usize).skip(region.y[0]).take(region.height());
-    planes.zip(confirmed.par_chunks_exact_mut(region.width().max(1))).enumerate().for_each(|(y, (values, confirmed))| {
+    let rows = disparity.par_chunks_exact_mut(width.max(1) as usize).zip(confirmed.par_chunks_exact_mut(width.max(1) as usize));
+    rows.skip(region.y[0]).take(region.height()).enumerate().for_each(|(y, (values, confirmed))| {
         let row = y * region.width()..(y + 1) * region.width();
-        let best = &matches.best[row.clone()];
+        let (best, confirmed) = (&matches.best[row.clone()], &mut confirmed[region.x[0]..region.x[1]]);
         validate::confirm(best, &owners, y, tolerance, confirmed);
         let costs = matches.cost[row.clone()].iter().zip(&matches.rival[row]);
         let found = best.iter().zip(costs).zip(confirmed).zip(&mut values[region.x[0]..region.x[1]]);

@@ -1,30 +1,32 @@
 //! World points with covariance.
 //!
 //! X(u, v, d) is [`Rectification::world_from_pixel`]; with its Jacobian J,
-//!   Σ = J diag(σ_p², σ_p², σ_d²) Jᵀ.                                                                (1)
+//!   Σ = J diag(σ_p², σ_p², σ_d²) Jᵀ,                                                                (1)
+//! σ_d of each pixel from [`super::subpixel`]. Confidence: 1 / (1 + (σ_d / 0.1 px)²).
 
 use super::cloud::{Cloud, CloudPoint};
+use super::subpixel::Refined;
 use crate::rig::rectify::{Plane, Rectification};
 use nalgebra::{Matrix3, Vector3};
 
 /// Standard deviation of where in its window a disparity belongs, px: about half of the smallest window.
 const PIXEL_SIGMA_PX: f64 = 1.0;
 
-/// Standard deviation of a validated disparity, px: measured on rendered footage with 2 grey levels of noise (median error 0.11
-/// px on bodies, with longer tails than a Gaussian's).
-const DISPARITY_SIGMA_PX: f64 = 0.16;
+/// σ_d at which the confidence is a half, px: the median on footage with 2 grey levels of noise.
+const HALF_CONFIDENCE_PX: f64 = 0.1;
 
-/// Points of all known disparities of the reference view; `confidence` and `grey` are pictures of the same size.
-pub fn triangulate(rectification: &Rectification, disparity: &Plane, confidence: &Plane, grey: &Plane) -> Cloud {
-    let known = disparity.enumerate_pixels().filter(|(_, _, d)| d.0[0] > 0.0);
+/// Points of all known disparities of the reference view; `grey` is its picture.
+pub fn triangulate(rectification: &Rectification, refined: &Refined, grey: &Plane) -> Cloud {
+    let known = refined.disparity.enumerate_pixels().filter(|(_, _, d)| d.0[0] > 0.0);
     let point = |(u, v, d): (u32, u32, &image::Luma<f32>)| {
         let at = [f64::from(u), f64::from(v), f64::from(d.0[0])];
         let grey = grey.get_pixel(u, v).0[0].round().clamp(0.0, 255.0) as u8;
+        let sigma_px = f64::from(refined.sigma_px.get_pixel(u, v).0[0]);
         CloudPoint {
             position: rectification.world_from_pixel(at[0], at[1], at[2]),
             colour: [grey; 3],
-            confidence: f64::from(confidence.get_pixel(u, v).0[0]),
-            covariance: covariance(rectification, at, DISPARITY_SIGMA_PX),
+            confidence: 1.0 / (1.0 + (sigma_px / HALF_CONFIDENCE_PX).powi(2)),
+            covariance: covariance(rectification, at, sigma_px),
         }
     };
     Cloud { points: known.map(point).collect() }

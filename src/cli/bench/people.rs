@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
-use image::{GrayImage, ImageBuffer, Luma};
-use muybridge::clouds::{Cloud, CloudOptions, CloudRig, FrameCloud};
+use image::{GrayImage, ImageBuffer, Luma, Rgb, RgbImage};
+use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::footage::{FrameSet, regions};
 use muybridge::io::images::read_grey;
 use muybridge::io::session::Session;
@@ -26,6 +26,9 @@ pub struct PeopleArgs {
     /// Session folders with truth/depth_CAM and truth/mask_CAM of the reference camera, as `muybridge render --depth-every` writes them
     #[arg(required = true)]
     sessions: Vec<PathBuf>,
+    /// Folder for pictures of the disparity errors of every frame and method
+    #[arg(long, value_name = "DIR")]
+    pictures: Option<PathBuf>,
 }
 
 /// True depth of a raw pixel is in steps of this, metres; 0 is nothing.
@@ -42,7 +45,7 @@ pub fn run(args: &PeopleArgs) -> Result<()> {
         "{:<22}{:<18}{:>8}{:>9}{:>8}{:>9}{:>8}{:>9}{:>7}{:>7}{:>6}{:>7}{:>8}",
         "session", "method", "med mm", "density", ">1px", "kept", ">1px", "off bef", "aft", "far", "z", "IoU", "ms"
     );
-    args.sessions.iter().try_for_each(|folder| bench(folder).with_context(|| folder.display().to_string()))
+    args.sessions.iter().try_for_each(|folder| bench(folder, args.pictures.as_deref()).with_context(|| folder.display().to_string()))
 }
 
 /// What is known of one frame of the reference camera.
@@ -68,7 +71,7 @@ struct Score {
     seconds: Vec<f64>,
 }
 
-fn bench(folder: &Path) -> Result<()> {
+fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
     let (session, _) = Session::open(folder, None)?;
     let options = CloudOptions::default();
     let stages = session.stages()?;
@@ -76,7 +79,8 @@ fn bench(folder: &Path) -> Result<()> {
     let (group, _) = full.groups.first().context("the rig has no group")?;
     let order: Vec<usize> = group.views.iter().map(|v| v.index).collect();
     let truths = truths(&session, order[0])?;
-    let frames: Vec<FrameSet> = session.frames().filter(|f| f.as_ref().map_or(true, |f| truths[f.number].is_some())).collect::<Result<_, _>>()?;
+    let frames: Vec<FrameSet> =
+        session.frames().filter(|f| f.as_ref().map_or(true, |f| truths[f.number].is_some())).collect::<Result<_, _>>()?;
     let mut subsets = if order.len() > 2 { vec![order.clone()] } else { Vec::new() };
     subsets.extend(order[1..].iter().map(|&other| vec![order[0], other]));
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
@@ -95,6 +99,11 @@ fn bench(folder: &Path) -> Result<()> {
             ours.seconds.push(begun.elapsed().as_secs_f64());
             ours.add(&ready.groups[0].0, truth, &found.matched, &found);
             ours.add_cloud(&ready.groups[0].0, truth, &found);
+            if let (Some(pictures), true) = (pictures, truth.depth.is_some()) {
+                let path = pictures.join(format!("{name}_{label}_{:06}.png", frame.number));
+                let picture = error_picture(&ready.groups[0].0, truth, &images[0], &found);
+                picture.save(&path).with_context(|| format!("cannot write {}", path.display()))?;
+            }
             if cameras.len() == 2 {
                 let begun = Instant::now();
                 let theirs = semi_global(&ready.groups[0].0, &images, options.nearest_m)?;
@@ -195,8 +204,7 @@ impl Score {
         let near = regions::dilate(&truth.mask, FAR_PX);
         let near = Truth { mask: near, depth: None };
         let axis = view.camera.camera_from_world.inverse() * Vector3::z();
-        let Cloud { points } = &found.cloud;
-        for point in points {
+        for point in &found.cloud.points {
             let Some(raw) = view.camera.project(&point.position) else { continue };
             self.after[0] += 1;
             self.after[1] += usize::from(!truth.on_person(&raw));
@@ -213,7 +221,8 @@ impl Score {
     }
 
     fn row(&self, session: &str, method: &str) -> String {
-        let percent = |part: usize, whole: usize| if whole == 0 { "-".into() } else { format!("{:.2}", 100.0 * part as f64 / whole as f64) };
+        let percent =
+            |part: usize, whole: usize| if whole == 0 { "-".into() } else { format!("{:.2}", 100.0 * part as f64 / whole as f64) };
         let median = |values: &[f64]| quantile(values.to_vec(), 0.5).unwrap_or(f64::NAN);
         let within: Vec<f64> = self.normalised.iter().copied().filter(|z| z.abs() < 3.0).collect();
         let variance = within.iter().map(|z| z * z).sum::<f64>() / within.len() as f64;
@@ -232,6 +241,30 @@ impl Score {
             1e3 * median(&self.seconds)
         )
     }
+}
+
+/// The searched part of the reference view: disparity errors from -2 px (blue) to 2 px (red) on the body, white without a
+/// disparity; magenta: cloud points off the person; grey: everything else.
+fn error_picture(group: &Rectification, truth: &Truth, reference: &GrayImage, found: &FrameCloud) -> RgbImage {
+    let plane = group.warp(0, reference);
+    let colour = |u: u32, v: u32| {
+        let grey = plane.get_pixel(u, v).0[0].clamp(0.0, 255.0) as u8;
+        let at = Vector2::new(f64::from(u), f64::from(v));
+        let Some(raw) = group.raw_pixel(0, &at) else { return Rgb([grey; 3]) };
+        let (d, kept) = (found.matched.get_pixel(u, v).0[0], found.disparity.get_pixel(u, v).0[0]);
+        let expected = truth.body_point(group, &raw).and_then(|x| disparity_of(group, &x));
+        let Some(expected) = expected else {
+            return if kept > 0.0 && !truth.on_person(&raw) { Rgb([255, 0, 255]) } else { Rgb([grey; 3]) };
+        };
+        if d.is_nan() {
+            return Rgb([255; 3]);
+        }
+        let error = ((f64::from(d) - expected) / 2.0).clamp(-1.0, 1.0);
+        let strength = (255.0 * error.abs().sqrt()) as u8;
+        let rest = grey / 2;
+        if error > 0.0 { Rgb([rest.saturating_add(strength), rest, rest]) } else { Rgb([rest, rest, rest.saturating_add(strength)]) }
+    };
+    RgbImage::from_fn(group.size_px[0], group.size_px[1], colour)
 }
 
 /// OpenCV's disparities of a rectified pair in the reference view, NaN where it has none.

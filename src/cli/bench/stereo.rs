@@ -73,7 +73,14 @@ fn scenes(folder: &Path) -> Result<Vec<Scene>> {
             let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
             if let Some(middle) = file("im4.png") {
                 let third = Some(right.clone());
-                found.push(Scene { name: name.clone(), left: left.clone(), right: middle, third, truth: [Some(truth.clone()), None], scale: 2.0 * scale });
+                found.push(Scene {
+                    name: name.clone(),
+                    left: left.clone(),
+                    right: middle,
+                    third,
+                    truth: [Some(truth.clone()), None],
+                    scale: 2.0 * scale,
+                });
             }
             found.push(Scene { name, left, right, third: None, truth: [Some(truth), other], scale: *scale });
         }
@@ -147,7 +154,11 @@ fn accuracy(scenes: &[Scene]) -> Result<usize> {
             Ok(Some(Grey::read(path, IMREAD_UNCHANGED)?.values()?.iter().map(|v| v / scene.scale).collect()))
         };
         let truth = known(&scene.truth[0])?.unwrap_or_default();
-        ensure!(truth.len() == left.width * left.mat.rows() as usize, "{}: the truth has another size than the views", scene.left.display());
+        ensure!(
+            truth.len() == left.width * left.mat.rows() as usize,
+            "{}: the truth has another size than the views",
+            scene.left.display()
+        );
         let counts = visible(&truth, known(&scene.truth[1])?.as_deref(), left.width);
         let disparities = (truth.iter().copied().fold(0.0, f32::max) as usize / 16 + 1) * 16;
         let views = [view(left.plane()?, [0.0, 0.0]), view(right.plane()?, [-1.0, 0.0])];
@@ -157,11 +168,17 @@ fn accuracy(scenes: &[Scene]) -> Result<usize> {
         let cells = |s: &Score| format!("{:>9.3} {:>6.2} % {:>5.3}", s.density, 100.0 * s.bad, s.mean_px);
         if let Some(third) = &scene.third {
             let [first, second] = views;
-            let three = score(&ours(&[first, second, view(Grey::read(third, IMREAD_GRAYSCALE)?.plane()?, [-2.0, 0.0])], disparities), &truth, &counts);
+            let three = score(
+                &ours(&[first, second, view(Grey::read(third, IMREAD_GRAYSCALE)?.plane()?, [-2.0, 0.0])], disparities),
+                &truth,
+                &counts,
+            );
             let (two, block) = (score(&two, &truth, &counts), score(&block, &truth, &counts));
             println!("{:<20}{}{}{}", format!("{}, 3 views", scene.name), cells(&three), cells(&block), cells(&semi_global));
             println!("{:<20}{}   three / two views in mean error: {:.2}", "  two of them", cells(&two), three.mean_px / two.mean_px);
-            short += usize::from(three.mean_px > semi_global.mean_px || three.mean_px > 0.7 * two.mean_px || three.density < 0.95 * semi_global.density);
+            short += usize::from(
+                three.mean_px > semi_global.mean_px || three.mean_px > 0.7 * two.mean_px || three.density < 0.95 * semi_global.density,
+            );
             continue;
         }
         let both: Vec<bool> = (0..truth.len()).map(|i| counts[i] && two[i] > 0.0 && block[i] > 0.0).collect();
@@ -232,7 +249,8 @@ impl Triple {
     fn new(width: u32, height: u32) -> Self {
         let texture = |x: f64, y: f64| {
             let wave = |a: f64, b: f64, c: f64| (a * x + b * y + c).sin();
-            let fine = wave(0.9, 0.31, 0.3) + wave(-0.43, 0.83, 1.1) + wave(1.37, -0.71, 2.0) + wave(0.23, 1.19, 0.7) + wave(0.61, 0.57, 1.9);
+            let fine =
+                wave(0.9, 0.31, 0.3) + wave(-0.43, 0.83, 1.1) + wave(1.37, -0.71, 2.0) + wave(0.23, 1.19, 0.7) + wave(0.61, 0.57, 1.9);
             128.0 + 18.0 * fine + 20.0 * wave(0.171, 0.093, 0.0) * wave(0.077, -0.139, 2.0)
         };
         let (w, h) = (f64::from(width), f64::from(height));
