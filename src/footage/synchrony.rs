@@ -368,7 +368,7 @@ mod tests {
             name: format!("{x}"),
             size_px: [160, 120],
             matrix: Matrix3::new(150.0, 0.0, 80.0, 0.0, 150.0, 60.0, 0.0, 0.0, 1.0),
-            distortion: [0.0; 5],
+            lens: crate::rig::Lens::IDEAL,
             camera_from_world: Rotation3::identity(),
             translation: Vector3::new(-x, 0.0, 0.0),
         };
