@@ -15,7 +15,7 @@ use rayon::prelude::*;
 pub struct StereoOptions {
     /// Half-width of the correlation window, px. 1 is noisy, 4 fattens limbs of 20 px.
     pub radius: usize,
-    /// How much dearer the best rival must be, as a fraction of the winner's cost.
+    /// How much dearer the best rival must be, as a fraction of the winner's cost; twice that where a view does not confirm.
     pub uniqueness: f32,
     /// Tolerance of the check between views, px.
     pub consistency_px: f32,
@@ -86,7 +86,8 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
         let costs = matches.cost[row.clone()].iter().zip(&matches.rival[row]);
         let found = best.iter().zip(costs).zip(confirmed).zip(&mut values[region.x[0]..region.x[1]]);
         for (((best, (cost, rival)), confirmed), value) in found {
-            if *confirmed != 0 && validate::unique(cost[1], *rival, options.uniqueness) {
+            let ratio = if confirmed.count_ones() as usize == owners.len() { options.uniqueness } else { 2.0 * options.uniqueness };
+            if *confirmed != 0 && validate::unique(cost[1], *rival, ratio) {
                 *value = equiangular(*cost).map_or(f32::NAN, |offset| (f32::from(*best) + offset) * px);
             }
         }
