@@ -6,7 +6,11 @@ pub mod corner;
 pub mod epipolar;
 pub mod foreground;
 pub mod pattern;
+pub mod misfit;
+pub mod person;
+pub mod reduce;
 pub mod regions;
+pub mod synchrony;
 
 pub use foreground::{ForegroundOptions, foreground, spread, stage_from_frames};
 
