@@ -5,7 +5,6 @@ use super::prefilter;
 use super::subpixel::equiangular;
 use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
-use image::Luma;
 use nalgebra::Vector2;
 use rayon::prelude::*;
 
@@ -103,7 +102,7 @@ fn others_of(views: &[StereoView], k: usize) -> impl Iterator<Item = &StereoView
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::GrayImage;
+    use image::{GrayImage, Luma};
     use std::path::Path;
 
     /// A band-limited texture without repetition in view.
