@@ -9,7 +9,7 @@ use muybridge::io::calib_toml::read_rig;
 use muybridge::motion::{Length, play_cycle};
 use muybridge::motion_model::{Activity, synthetic};
 use muybridge::phantom::{Scene, Stage, View, depth, distance_to_skin, mask, render, render_stage, staging};
-use muybridge::rig::Rig;
+use muybridge::rig::{Lens, Rig};
 use nalgebra::{Matrix3, Vector3};
 use opencv::core::{CV_32F, CV_32FC1, Mat, Point3f, Scalar, Size, Vec3f};
 use opencv::{calib3d, imgproc, prelude::*};
@@ -87,7 +87,10 @@ fn semi_global(take: &Take) -> Vec<Vector3<f64>> {
     let matrix = |m: &Matrix3<f64>| Mat::from_slice_2d(&[[m[(0, 0)], m[(0, 1)], m[(0, 2)]], [m[(1, 0)], m[(1, 1)], m[(1, 2)]], [m[(2, 0)], m[(2, 1)], m[(2, 2)]]]).unwrap();
     let b_from_a = b.camera_from_world * a.camera_from_world.inverse();
     let t = b.translation - b_from_a * a.translation;
-    let lens = [a, b].map(|c| (matrix(&c.matrix), Mat::from_slice(&c.distortion).unwrap().try_clone().unwrap()));
+    let lens = [a, b].map(|c| {
+        let Lens::BrownConrady(terms) = c.lens else { panic!("not a fisheye rig") };
+        (matrix(&c.matrix), Mat::from_slice(&terms).unwrap().try_clone().unwrap())
+    });
     let size = Size::new(640, 480);
     let [mut r1, mut r2, mut p1, mut p2, mut q] = [0; 5].map(|_| Mat::default());
     let (rotation, translation) = (matrix(b_from_a.matrix()), Mat::from_slice_2d(&[[t.x], [t.y], [t.z]]).unwrap());

@@ -3,7 +3,7 @@
 use anyhow::{Context, Result, bail};
 use image::GrayImage;
 use muybridge::clouds::correlate::Region;
-use muybridge::clouds::stereo::{PreparedView, StereoOptions, match_views};
+use muybridge::clouds::stereo::{StereoOptions, StereoView, match_view};
 use muybridge::io::pfm::write_pfm;
 use muybridge::rig::rectify::Plane;
 use nalgebra::Vector2;
@@ -24,8 +24,8 @@ pub struct DisparityArgs {
     /// camera in a row, -1,0 one on the other side.
     #[arg(long, value_name = "X,Y", allow_hyphen_values = true, requires = "third", value_parser = two_numbers)]
     third_baseline: Option<[f64; 2]>,
-    /// Largest disparity between left and right, pixels.
-    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=4096))]
+    /// Disparities between left and right are sought below this, pixels.
+    #[arg(long, value_parser = clap::value_parser!(u16).range(2..=4096))]
     max_disparity: u16,
     /// Portable float map: the left view's disparities in pixels, infinity where there is none.
     #[arg(short, long)]
@@ -58,10 +58,11 @@ pub fn run(args: &DisparityArgs) -> Result<()> {
             size.1
         );
     }
-    let views: Vec<PreparedView> = views.iter().map(|(_, image, step)| PreparedView::new(plane(image), *step)).collect();
+    let views: Vec<StereoView> = views.iter().map(|(_, image, step)| StereoView { plane: plane(image), step: *step }).collect();
     let all = Region { x: [0, size.0 as usize], y: [0, size.1 as usize] };
-    let found = match_views(&views, &vec![all; views.len()], [0, args.max_disparity.into()], &StereoOptions::default());
-    Ok(write_pfm(&args.output, &found[0].disparity)?)
+    let range = [0, usize::from(args.max_disparity) - 1];
+    let found = match_view(&views, 0, all, range, &StereoOptions::default());
+    Ok(write_pfm(&args.output, &found.disparity)?)
 }
 
 fn read_grey(path: &Path) -> Result<GrayImage> {

@@ -11,6 +11,7 @@ mod motions;
 mod observe;
 mod progress;
 mod render;
+mod rig;
 mod track;
 mod whole;
 
@@ -37,6 +38,9 @@ enum Command {
     Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
+    /// Rig files: in words and a picture, and from one form to another
+    #[command(subcommand)]
+    Rig(rig::RigCommand),
     /// Motion databases and their PCA models
     #[command(subcommand)]
     Model(model::ModelCommand),
@@ -74,6 +78,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),
         Command::Render(args) => render::run(&args),
+        Command::Rig(command) => rig::run(&command),
         Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),

@@ -199,7 +199,7 @@ mod tests {
             name: name.into(),
             size_px: [96, 72],
             matrix: Matrix3::new(80.0, 0.0, 47.5, 0.0, 80.0, 35.5, 0.0, 0.0, 1.0),
-            distortion: [-0.05, 0.0, 0.0, 0.0, 0.0],
+            lens: muybridge::rig::Lens::BrownConrady([-0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
             camera_from_world: Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
             translation: Vector3::new(-x, 1.0, 0.0),
         };

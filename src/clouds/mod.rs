@@ -4,6 +4,7 @@ pub mod cloud;
 pub mod correlate;
 pub mod edges;
 pub mod frame;
+mod lanes;
 pub mod prefilter;
 pub mod stage;
 pub mod stereo;

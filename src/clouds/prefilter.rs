@@ -1,49 +1,68 @@
-//! Local mean and contrast normalisation before correlation.
+//! Gradient along the baseline before correlation.
 //!
-//!   g = (I − m) / (s + s0),   m = G_σ * I,   s² = G_σ * (I − m)²,                                    (1)
-//! stored in 8 bits as 128 + 40 g. Gain and offset between cameras vanish, weak texture weighs as much as strong, and the
-//! floor s0 keeps sensor noise from being taken for texture.
+//!   G = 128 + clip(∂I/∂b, ±c),   ∂/∂b = (b_x D_x + b_y D_y) / |b|,                                  (1)
+//! with Sobel's D_x = [−1 0 1]ᵀ[1 2 1] and D_y its transpose. An offset between cameras vanishes, a gain changes the weak
+//! gradients little and the clipped ones not at all. Only intensity changes along the baseline tell a disparity, so each
+//! pair of views has its own direction.
 //!
-//! Departure from OpenCV's NORMALIZED_RESPONSE: a Gaussian instead of a box, which rings less at the person's outline.
+//! OpenCV's StereoBM and StereoSGBM use D_x too. Checked against cv::Sobel; alternatives are in [`super::correlate`]'s table.
 
 use crate::rig::rectify::Plane;
 use image::GrayImage;
+use nalgebra::Vector2;
 use rayon::prelude::*;
 
-/// Wider lets the outline's contrast change the values of pixels further inside; narrower removes the texture itself.
-const SIGMA_PX: f32 = 1.5;
+/// c of (1), grey levels times 4 per pixel: smaller drowns edges in noise, larger lets one strong edge outvote its window.
+const CAP: f32 = 31.0;
 
-/// About twice the noise of an 8-bit camera, grey levels. Smaller amplifies noise on bare walls, larger forgets weak texture.
-const CONTRAST_FLOOR: f32 = 5.0;
+/// Adding 1.5 2^23 rounds a number to the last bit of its mantissa, whose low byte is then the integer; that of NaN is 0. Much
+/// faster than a conversion that has to think of NaN.
+const ROUND_TO_128: f32 = 12_582_912.0 + 128.0;
 
-/// Grey steps per unit of g: 3 standard deviations fill the 8 bits.
-const GAIN: f32 = 40.0;
-
-/// The normalised picture of equation (1), 1 to 255; 0 where the plane is NaN.
-pub fn normalise(plane: &Plane) -> GrayImage {
-    let (width, height) = plane.dimensions();
-    let filled = fill_unknown(plane);
-    let mean = blur(&filled, width as usize, SIGMA_PX);
-    let centred: Vec<f32> = filled.par_iter().zip(&mean).map(|(i, m)| i - m).collect();
-    let squares: Vec<f32> = centred.par_iter().map(|c| c * c).collect();
-    let variance = blur(&squares, width as usize, SIGMA_PX);
-    let value = |((c, v), raw): ((&f32, &f32), &f32)| {
-        if raw.is_nan() { 0 } else { (128.0 + GAIN * c / (v.max(0.0).sqrt() + CONTRAST_FLOOR)).round().clamp(1.0, 255.0) as u8 }
-    };
-    let values = centred.par_iter().zip(&variance).zip(plane.as_raw()).map(value).collect();
-    GrayImage::from_raw(width, height, values).expect("one value per pixel")
+/// The picture of equation (1), 97 to 159; 0 where a pixel or a neighbour is NaN. Borders are replicated.
+pub fn gradient(plane: &Plane, along: Vector2<f64>) -> GrayImage {
+    let (width, height) = (plane.width() as usize, plane.height() as usize);
+    let along = along.normalize().map(|v| v as f32);
+    let mut values = vec![0u8; width * height];
+    let row = |y: usize| &plane.as_raw()[y.min(height - 1) * width..][..width];
+    values.par_chunks_exact_mut(width.max(1)).enumerate().for_each(|(y, out)| {
+        gradient_row([row(y.saturating_sub(1)), row(y), row(y + 1)], [along.x, along.y], out);
+    });
+    GrayImage::from_raw(plane.width(), plane.height(), values).expect("one value per pixel")
 }
 
-/// Unknown pixels take the last known value of their row, so that the filter rings little at the border.
-fn fill_unknown(plane: &Plane) -> Vec<f32> {
-    let mut values = plane.as_raw().clone();
-    for row in values.chunks_exact_mut(plane.width().max(1) as usize) {
-        let mut last = row.iter().copied().find(|v| !v.is_nan()).unwrap_or(128.0);
-        for v in row {
-            if v.is_nan() { *v = last } else { last = *v }
-        }
+fn gradient_row(rows: [&[f32]; 3], along: [f32; 2], out: &mut [u8]) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { gradient_row_avx2(rows, along, out) };
     }
-    values
+    gradient_row_plain(rows, along, out);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn gradient_row_avx2(rows: [&[f32]; 3], along: [f32; 2], out: &mut [u8]) {
+    gradient_row_plain(rows, along, out);
+}
+
+/// Equation (1) of the middle row.
+#[inline(always)]
+fn gradient_row_plain(rows: [&[f32]; 3], [right, down]: [f32; 2], out: &mut [u8]) {
+    let (width, code) = (out.len(), |slope: f32| (ROUND_TO_128 + slope.clamp(-CAP, CAP)).to_bits() as u8);
+    let Some(inner) = width.checked_sub(2) else { return out.fill(code(0.0)) };
+    let [[a, b, c], [d, _, f], [g, h, i]] = rows.map(|row| [&row[..inner], &row[1..=inner], &row[2..width]]);
+    for (x, out) in out[1..=inner].iter_mut().enumerate() {
+        let across = (c[x] - a[x]) + 2.0 * (f[x] - d[x]) + (i[x] - g[x]);
+        let along = (g[x] - a[x]) + 2.0 * (h[x] - b[x]) + (i[x] - c[x]);
+        *out = code(right * across + down * along);
+    }
+    let [above, here, below] = rows;
+    for (x, from, to) in [(0, 0, 1), (width - 1, width - 2, width - 1)] {
+        let across = (above[to] - above[from]) + 2.0 * (here[to] - here[from]) + (below[to] - below[from]);
+        let along = (below[from] - above[from]) + 2.0 * (below[x] - above[x]) + (below[to] - above[to]);
+        out[x] = code(right * across + down * along);
+    }
 }
 
 /// Gaussian blur with replicated borders.
@@ -84,14 +103,26 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gain_and_offset_vanish_where_there_is_texture() {
-        let texture = |x: u32, y: u32| 90.0 * ((x * x + 3 * y * x + 7 * y) as f32 * 0.37).sin();
-        let a = Plane::from_fn(80, 60, |x, y| image::Luma([100.0 + texture(x, y)]));
-        let b = Plane::from_fn(80, 60, |x, y| image::Luma([90.0 + 0.9 * texture(x, y)]));
-        let (fa, fb) = (normalise(&a), normalise(&b));
-        let difference = fa.as_raw().iter().zip(fb.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / 4800.0;
-        let contrast = fa.as_raw().iter().map(|a| f64::from(a.abs_diff(128))).sum::<f64>() / 4800.0;
-        assert!(difference < 0.6 && contrast > 20.0, "difference {difference}, contrast {contrast}");
+    fn gradients_meet_opencv() {
+        use opencv::{core, imgproc, prelude::*};
+        let values: Vec<f32> = (0..50 * 40).map(|i| ((i * 7919) % 13) as f32).collect();
+        let plane = Plane::from_raw(50, 40, values.clone()).unwrap();
+        let source = core::Mat::new_rows_cols_with_data(40, 50, &values).unwrap();
+        for (along, dx) in [(Vector2::new(-1.0, 0.0), 1), (Vector2::new(0.0, 2.0), 0)] {
+            let mut expected = core::Mat::default();
+            imgproc::sobel(&source, &mut expected, core::CV_32F, dx, 1 - dx, 3, 1.0, 0.0, core::BORDER_REPLICATE).unwrap();
+            let sign = if dx == 1 { -1.0 } else { 1.0 };
+            for (ours, theirs) in gradient(&plane, along).iter().zip(expected.data_typed::<f32>().unwrap()) {
+                assert_eq!(f32::from(*ours), 128.0 + (sign * theirs).clamp(-CAP, CAP), "{along:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn diagonal_gradient_is_the_mean_of_both() {
+        let plane = Plane::from_fn(9, 9, |x, y| image::Luma([2.0 * x as f32 + 0.5 * y as f32]));
+        let diagonal = gradient(&plane, Vector2::new(1.0, 1.0));
+        assert_eq!(diagonal.get_pixel(4, 4).0[0], (128.0 + 8.0 * 2.5 / 2f32.sqrt()).round() as u8);
     }
 
     #[test]
@@ -109,7 +140,7 @@ mod tests {
     #[test]
     fn unknown_stays_unknown() {
         let plane = Plane::from_fn(30, 20, |x, y| image::Luma([if x < 5 { f32::NAN } else { (x * y) as f32 }]));
-        let f = normalise(&plane);
-        assert!(f.enumerate_pixels().all(|(x, _, p)| (p.0[0] == 0) == (x < 5)));
+        let unknown = |v: u8| v == 0;
+        assert!(gradient(&plane, Vector2::new(1.0, 0.0)).enumerate_pixels().all(|(x, _, p)| unknown(p.0[0]) == (x < 6)));
     }
 }

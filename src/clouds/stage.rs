@@ -9,7 +9,7 @@
 
 use super::correlate::Region;
 use super::prefilter::blur;
-use super::stereo::{PreparedView, StereoOptions, ViewDisparity, match_views};
+use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
 use crate::footage::regions;
 use crate::rig::rectify::{Plane, Rectification};
 use image::{GrayImage, Luma};
@@ -67,8 +67,8 @@ pub(crate) struct StageView {
 impl Stage {
     /// Matches the pictures of the empty stage, one per camera of the rig, up to the largest disparity.
     pub(crate) fn measure(rectification: &Rectification, images: &[&GrayImage], largest_px: usize, options: &StereoOptions) -> Self {
-        let prepared: Vec<PreparedView> =
-            (0..images.len()).map(|k| PreparedView::new(rectification.warp(k, images[k]), rectification.views[k].step)).collect();
+        let prepared: Vec<StereoView> =
+            (0..images.len()).map(|k| StereoView { plane: rectification.warp(k, images[k]), step: rectification.views[k].step }).collect();
         let regions = vec![whole(rectification); prepared.len()];
         let found = match_views(&prepared, &regions, [0, largest_px], options);
         let views = prepared.into_iter().zip(found).map(|(p, f)| StageView {

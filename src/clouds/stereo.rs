@@ -1,22 +1,20 @@
-//! Dense disparities of two or three rectified views: every view is searched as the reference, and they must agree.
+//! Dense disparities of two or three rectified views, seen from one of them.
 
-use super::correlate::{Matches, Region, Search, correlate};
-use super::{prefilter, validate};
+use super::correlate::{Matches, Pair, Region, correlate};
+use super::prefilter;
+use super::subpixel::equiangular;
+use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
-use image::GrayImage;
+use image::Luma;
 use nalgebra::Vector2;
+use rayon::prelude::*;
 
 /// How to match. The defaults suit a person of a few hundred pixels.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StereoOptions {
-    /// Half-width of the small correlation box, px; the windows that lean on it reach three times as far. 1 is noisy, 4 fattens
-    /// limbs of 20 px.
+    /// Half-width of the correlation window, px. 1 is noisy, 4 fattens limbs of 20 px.
     pub radius: usize,
-    /// Largest difference of one pixel, in steps of the normalised picture (40 is one local standard deviation).
-    pub truncation: u8,
-    /// Extra cost per pixel for counting only one of two pairs.
-    pub occlusion_penalty: u16,
     /// How much dearer the best rival must be, as a fraction of the winner's cost.
     pub uniqueness: f32,
     /// Tolerance of the check between views, px.
@@ -29,33 +27,17 @@ pub struct StereoOptions {
 
 impl Default for StereoOptions {
     fn default() -> Self {
-        Self {
-            radius: 2,
-            truncation: 50,
-            occlusion_penalty: 12,
-            uniqueness: 0.2,
-            consistency_px: 1.0,
-            speckle_area_px: 100,
-            speckle_step_px: 1.5,
-        }
+        Self { radius: 2, uniqueness: 0.1, consistency_px: 1.0, speckle_area_px: 100, speckle_step_px: 1.5 }
     }
 }
 
-/// One view of a rectified group, ready for matching.
+/// One view of a rectified group.
 #[derive(Clone, Debug)]
-pub struct PreparedView {
+pub struct StereoView {
     /// Rectified picture, grey levels; NaN where unknown.
     pub plane: Plane,
-    /// Normalised for correlation; 0 where unknown.
-    pub feature: GrayImage,
     /// As in [`crate::rig::rectify::RectifiedView::step`].
     pub step: Vector2<f64>,
-}
-
-impl PreparedView {
-    pub fn new(plane: Plane, step: Vector2<f64>) -> Self {
-        Self { feature: prefilter::normalise(&plane), plane, step }
-    }
 }
 
 /// Disparities seen from one view.
@@ -68,41 +50,59 @@ pub struct ViewDisparity {
     pub matches: Matches,
 }
 
-/// Matches all views against each other; `regions` say where each view is searched, `range` the disparities first..=last.
-pub fn match_views(views: &[PreparedView], regions: &[Region], range: [usize; 2], options: &StereoOptions) -> Vec<ViewDisparity> {
-    let search = Search {
-        first: range[0],
-        last: range[1],
-        radius: options.radius,
-        truncation: options.truncation,
-        occlusion_penalty: options.occlusion_penalty,
-    };
-    let searched: Vec<Matches> = (0..views.len())
-        .map(|k| {
-            let others: Vec<_> = others_of(views, k).map(|o| (&o.feature, o.step - views[k].step)).collect();
-            correlate(&views[k].feature, &others, regions[k], &search)
-        })
-        .collect();
-    let size = |k: usize| [views[k].plane.width(), views[k].plane.height()];
-    let unique: Vec<Plane> = searched.iter().enumerate().map(|(k, m)| validate::unique(m, size(k), options.uniqueness)).collect();
-    let winners: Vec<Plane> = searched.iter().enumerate().map(|(k, m)| validate::unique(m, size(k), 0.0)).collect();
-    let finish = |(k, matches): (usize, Matches)| {
-        let others: Vec<_> = (0..views.len()).filter(|&j| j != k).map(|j| (&winners[j], views[j].step - views[k].step)).collect();
-        let (mut disparity, confirmed) = validate::consistent(&unique[k], &others, options.consistency_px);
-        validate::remove_speckles(&mut disparity, options.speckle_area_px, options.speckle_step_px);
-        ViewDisparity { disparity, confirmed, matches }
-    };
-    searched.into_iter().enumerate().map(finish).collect()
+/// Matches every view against the others; `regions` say where each is searched, `range` the disparities first..=last.
+pub fn match_views(views: &[StereoView], regions: &[Region], range: [usize; 2], options: &StereoOptions) -> Vec<ViewDisparity> {
+    (0..views.len()).map(|k| match_view(views, k, regions[k], range, options)).collect()
 }
 
-fn others_of(views: &[PreparedView], k: usize) -> impl Iterator<Item = &PreparedView> {
+/// Matches `region` of one view against one or two others of its size. Disparities `range` first..=last, px.
+///
+/// Hypotheses are as fine as the longest baseline sees them: a pixel there, half a pixel of disparity where it is twice as
+/// long as the baseline in which disparities are counted.
+pub fn match_view(views: &[StereoView], reference: usize, region: Region, range: [usize; 2], options: &StereoOptions) -> ViewDisparity {
+    let here = &views[reference];
+    let steps: Vec<Vector2<f64>> = others_of(views, reference).map(|o| o.step - here.step).collect();
+    let per_px = steps.iter().map(Vector2::amax).fold(f64::MIN_POSITIVE, f64::max);
+    let steps: Vec<Vector2<f64>> = steps.iter().map(|s| s / per_px).collect();
+    let pair = |(other, step): (&StereoView, &Vector2<f64>)| {
+        let gradient = |plane: &Plane| prefilter::gradient(plane, *step);
+        let (reference, other) = rayon::join(|| gradient(&here.plane), || gradient(&other.plane));
+        Pair { reference, other, step: *step }
+    };
+    let others: Vec<(&StereoView, &Vector2<f64>)> = others_of(views, reference).zip(&steps).collect();
+    let pairs: Vec<Pair> = others.into_par_iter().map(pair).collect();
+    let hypotheses = (range[0] as f64 * per_px) as usize..(range[1] as f64 * per_px).ceil() as usize + 1;
+    let matches = correlate(&pairs, region, hypotheses, options.radius);
+    let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(&matches, pair)).collect();
+    let (width, height) = here.plane.dimensions();
+    let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    let mut confirmed = vec![0; (width * height) as usize];
+    let (tolerance, px) = ((f64::from(options.consistency_px) * per_px) as u16, (1.0 / per_px) as f32);
+    let rows = disparity.par_chunks_exact_mut(width.max(1) as usize).zip(confirmed.par_chunks_exact_mut(width.max(1) as usize));
+    rows.skip(region.y[0]).take(region.height()).enumerate().for_each(|(y, (values, confirmed))| {
+        let row = y * region.width()..(y + 1) * region.width();
+        let (best, confirmed) = (&matches.best[row.clone()], &mut confirmed[region.x[0]..region.x[1]]);
+        validate::confirm(best, &owners, y, tolerance, confirmed);
+        let costs = matches.cost[row.clone()].iter().zip(&matches.rival[row]);
+        let found = best.iter().zip(costs).zip(confirmed).zip(&mut values[region.x[0]..region.x[1]]);
+        for (((best, (cost, rival)), confirmed), value) in found {
+            if *confirmed != 0 && validate::unique(cost[1], *rival, options.uniqueness) {
+                *value = equiangular(*cost).map_or(f32::NAN, |offset| (f32::from(*best) + offset) * px);
+            }
+        }
+    });
+    validate::remove_speckles(&mut disparity, options.speckle_area_px, options.speckle_step_px);
+    ViewDisparity { disparity, confirmed, matches }
+}
+
+fn others_of(views: &[StereoView], k: usize) -> impl Iterator<Item = &StereoView> {
     views.iter().enumerate().filter(move |(j, _)| *j != k).map(|(_, v)| v)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::Luma;
+    use image::GrayImage;
     use std::path::Path;
 
     /// A band-limited texture without repetition in view.
@@ -127,14 +127,14 @@ mod tests {
         for (b, c) in [(0.0, 0.0), (0.05, -0.03), (-0.04, 0.06)] {
             let a = 20.3;
             let views = [
-                PreparedView::new(picture(texture), Vector2::zeros()),
-                PreparedView::new(picture(|u, v| texture((u + a + c * v) / (1.0 - b), v)), Vector2::new(-1.0, 0.0)),
-                PreparedView::new(picture(|u, v| texture(u, (v - a - b * u) / (1.0 + c))), Vector2::new(0.0, 1.0)),
+                StereoView { plane: picture(texture), step: Vector2::zeros() },
+                StereoView { plane: picture(|u, v| texture((u + a + c * v) / (1.0 - b), v)), step: Vector2::new(-1.0, 0.0) },
+                StereoView { plane: picture(|u, v| texture(u, (v - a - b * u) / (1.0 + c))), step: Vector2::new(0.0, 1.0) },
             ];
             let all = Region { x: [0, 200], y: [0, 160] };
             for count in [2, 3] {
-                let found = match_views(&views[..count], &vec![all; count], [5, 45], &StereoOptions::default());
-                let inner = found[0].disparity.enumerate_pixels().filter(|(x, y, _)| (55..190).contains(x) && (10..110).contains(y));
+                let found = match_view(&views[..count], 0, all, [5, 45], &StereoOptions::default());
+                let inner = found.disparity.enumerate_pixels().filter(|(x, y, _)| (55..190).contains(x) && (10..110).contains(y));
                 let errors: Vec<f64> = inner
                     .filter(|(_, _, d)| !d.0[0].is_nan())
                     .map(|(x, y, d)| f64::from(d.0[0]) - (a + b * f64::from(x) + c * f64::from(y)))
@@ -166,9 +166,12 @@ mod tests {
         let (left, right) = (grey("im2.png"), grey("im6.png"));
         let (width, height) = left.dimensions();
         let plane = |g: &GrayImage| Plane::from_fn(width, height, |x, y| Luma([f32::from(g.get_pixel(x, y).0[0])]));
-        let views = [PreparedView::new(plane(&left), Vector2::zeros()), PreparedView::new(plane(&right), Vector2::new(-1.0, 0.0))];
+        let views = [
+            StereoView { plane: plane(&left), step: Vector2::zeros() },
+            StereoView { plane: plane(&right), step: Vector2::new(-1.0, 0.0) },
+        ];
         let all = Region { x: [0, width as usize], y: [0, height as usize] };
-        let ours = match_views(&views, &[all, all], [0, 64], &StereoOptions::default());
+        let ours = match_view(&views, 0, all, [0, 63], &StereoOptions::default());
         let pgm = opencv::imgcodecs::imread(folder.join("disp2.pgm").to_str().unwrap(), 0).unwrap();
         let truth: Vec<f32> = pgm.data_typed::<u8>().unwrap().iter().map(|v| f32::from(*v) / 4.0).collect();
         let mat = |g: &GrayImage| core::Mat::new_rows_cols_with_data(height as i32, width as i32, g.as_raw()).unwrap().try_clone().unwrap();
@@ -177,7 +180,7 @@ mod tests {
         let mut theirs = core::Mat::default();
         matcher.compute(&mat(&left), &mat(&right), &mut theirs).unwrap();
         let theirs: Vec<f32> = theirs.data_typed::<i16>().unwrap().iter().map(|v| f32::from(*v) / 16.0).collect();
-        let (ours, bm) = (score(ours[0].disparity.as_raw(), &truth), score(&theirs, &truth));
+        let (ours, bm) = (score(ours.disparity.as_raw(), &truth), score(&theirs, &truth));
         println!("cones: density {:.3}, above 1 px {:.4}; StereoBM {:.3}, {:.4}", ours.0, ours.1, bm.0, bm.1);
         assert!(ours.0 > bm.0 && ours.1 < bm.1, "{ours:?} {bm:?}");
     }

@@ -1,97 +1,169 @@
 //! Which matches to believe.
 //!
-//! - uniqueness: no rival more than one disparity away costs less than (1 + u) times the winner;
-//! - texture: the window's contrast along some baseline stands above noise;
-//! - consistency: the pixel that another view's own search finds there leads back (left-right, top-bottom). One confirming
-//!   view is enough, because near an outline the other view is often occluded;
-//! - speckle: connected pieces of slowly changing disparity smaller than an area are dropped (cv::filterSpeckles).
+//! - uniqueness: no rival more than one hypothesis away costs less than (1 + u) times the winner;
+//! - consistency: every pixel of another view belongs to the cheapest of the winners that lead to it; a winner stands when the
+//!   view's owner of its place has the same disparity (left-right, top-bottom, without matching again). One confirming view
+//!   is enough where the other does not contradict: an owner that is nearer hides the pixel, one that is farther would be
+//!   hidden by it;
+//! - surface: connected pieces of slowly changing disparity smaller than an area are dropped (cv::filterSpeckles).
+//!
+//! A bar for texture is left out: where there is none, rivals are as good as the winner, and a bar that adds anything to
+//! uniqueness takes bare skin first.
 
-use super::correlate::{Matches, NO_MATCH};
-use super::subpixel::equiangular;
+use super::correlate::{Matches, NO_MATCH, Pair};
 use crate::rig::rectify::Plane;
-use image::Luma;
-use nalgebra::Vector2;
+use image::GrayImage;
+use rayon::prelude::*;
 
-/// Sub-pixel disparities of the unique winners on the whole canvas; NaN elsewhere.
-pub fn unique(matches: &Matches, size_px: [u32; 2], ratio: f32) -> Plane {
-    let mut plane = Plane::from_pixel(size_px[0], size_px[1], Luma([f32::NAN]));
-    let region = matches.region;
-    for (i, (&best, &cost)) in matches.best.iter().zip(&matches.cost).enumerate() {
-        let alone = f32::from(matches.rival[i]) > f32::from(cost[1]) * (1.0 + ratio);
-        if let (true, true, Some(offset)) = (best != NO_MATCH, alone, equiangular(cost)) {
-            let (x, y) = (region.x[0] + i % region.width(), region.y[0] + i / region.width());
-            plane.put_pixel(x as u32, y as u32, Luma([f32::from(best) + offset]));
-        }
-    }
-    plane
+/// Whether the winner of a pixel stands alone.
+pub fn unique(cost: u8, rival: u8, ratio: f32) -> bool {
+    f32::from(rival) > f32::from(cost) * (1.0 + ratio)
 }
 
-/// Keeps disparities that at least one other view confirms within `tolerance_px`. `others` are the other views' own
-/// disparities with their steps against this view's. Returns the plane and for each pixel the bits of the confirming views.
-pub fn consistent(disparity: &Plane, others: &[(&Plane, Vector2<f64>)], tolerance_px: f32) -> (Plane, Vec<u8>) {
-    let width = disparity.width();
-    let mut kept = disparity.clone();
-    let mut confirmed = vec![0u8; kept.as_raw().len()];
-    for (i, value) in kept.iter_mut().enumerate() {
-        let at = Vector2::new(f64::from(i as u32 % width), f64::from(i as u32 / width));
-        for (k, (other, step)) in others.iter().enumerate() {
-            let there = at + step * f64::from(*value);
-            confirmed[i] |= u8::from(agrees(other, there, *value, tolerance_px)) << k;
-        }
-        if confirmed[i] == 0 {
-            *value = f32::NAN;
+/// Set beside the views' own bits where any contradicts.
+const CONTRADICTED: u8 = 1 << 7;
+
+/// Bits of the views that confirm each pixel of row `y` of a region, none where any contradicts.
+pub fn confirm(best: &[u16], owners: &[Owners], y: usize, tolerance: u16, bits: &mut [u8]) {
+    for (k, owners) in owners.iter().enumerate() {
+        let keys = &owners.keys[y * owners.width..];
+        for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
+            let Some(shift) = owners.shifts.get(usize::from(h)) else { continue };
+            let owner = keys[x + *shift as usize] as u16;
+            *bits |= u8::from(owner.abs_diff(h) <= tolerance) << k;
+            *bits |= if owner < h.saturating_sub(tolerance) { CONTRADICTED } else { 0 };
         }
     }
-    (kept, confirmed)
+    bits.iter_mut().for_each(|bits| *bits = if *bits & CONTRADICTED != 0 { 0 } else { *bits });
 }
 
-/// Whether one of the four pixels around `at` has the disparity.
-fn agrees(other: &Plane, at: Vector2<f64>, disparity: f32, tolerance_px: f32) -> bool {
-    let inside = |x: f64, y: f64| x >= 0.0 && y >= 0.0 && x < f64::from(other.width()) && y < f64::from(other.height());
-    let near = |x: f64, y: f64| inside(x, y) && (other.get_pixel(x as u32, y as u32).0[0] - disparity).abs() <= tolerance_px;
-    let (x, y) = (at.x.floor(), at.y.floor());
-    near(x, y) || near(x + 1.0, y) || near(x, y + 1.0) || near(x + 1.0, y + 1.0)
+/// For every place of another view, the cheapest winner that leads to it.
+pub struct Owners {
+    /// Cost above hypothesis, so that the least key is the cheapest winner, and of equal ones the farthest. Where nothing is
+    /// known the hypothesis is [`NO_MATCH`], nearer than all.
+    keys: Vec<u32>,
+    width: usize,
+    /// How far each hypothesis leads in `keys`.
+    shifts: Vec<u32>,
+}
+
+impl Owners {
+    pub fn new(matches: &Matches, pair: &Pair) -> Self {
+        let (width, height) = (matches.region.width(), matches.region.height());
+        let reach = matches.best.iter().filter(|b| **b != NO_MATCH).max().map_or(0, |b| usize::from(*b) + 1);
+        let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (pair.step * h as f64).map(|v| v.round() as isize).into()).collect();
+        let ends = |i: usize| shifts.iter().fold([0, 0], |[low, high], s| [s[i].min(low), s[i].max(high)]);
+        let ([left, right], [top, bottom]) = (ends(0), ends(1));
+        let wide = width + (right - left) as usize;
+        let mut keys = vec![u32::MAX; wide * (height + (bottom - top) as usize)];
+        let shifts: Vec<u32> = shifts.iter().map(|s| ((s[1] - top) as usize * wide + (s[0] - left) as usize) as u32).collect();
+        let rows = matches.best.chunks_exact(width.max(1)).zip(matches.cost.chunks_exact(width.max(1)));
+        for (y, (best, cost)) in rows.enumerate() {
+            for (x, (&h, cost)) in best.iter().zip(cost).enumerate().filter(|(_, (h, _))| **h != NO_MATCH) {
+                let key = &mut keys[y * wide + x + shifts[usize::from(h)] as usize];
+                *key = (*key).min(u32::from(cost[1]) << 16 | u32::from(h));
+            }
+        }
+        let start = [matches.region.x[0] as isize + left, matches.region.y[0] as isize + top];
+        hide_unknown(&mut keys, wide, &pair.other, start);
+        Self { keys, width: wide, shifts }
+    }
+}
+
+/// Marks the places of `keys`, whose first is pixel `start`, that the picture does not show.
+fn hide_unknown(keys: &mut [u32], wide: usize, picture: &GrayImage, start: [isize; 2]) {
+    let (width, height) = (picture.width() as isize, picture.height() as isize);
+    let (from, to) = (start[0].clamp(0, width), (start[0] + wide as isize).clamp(0, width));
+    for (y, keys) in (start[1]..).zip(keys.chunks_exact_mut(wide.max(1))) {
+        if y < 0 || y >= height || from >= to {
+            keys.fill(NO_MATCH.into());
+            continue;
+        }
+        let (first, count) = ((from - start[0]) as usize, (to - from) as usize);
+        let known = &picture.as_raw()[(y * width + from) as usize..][..count];
+        keys[..first].fill(NO_MATCH.into());
+        keys[first + count..].fill(NO_MATCH.into());
+        keys[first..].iter_mut().zip(known).for_each(|(key, &value)| *key = if value == 0 { NO_MATCH.into() } else { *key });
+    }
 }
 
 /// Removes connected pieces of fewer than `area_px` pixels; neighbours belong together when they differ by at most `step_px`.
 pub fn remove_speckles(disparity: &mut Plane, area_px: usize, step_px: f32) {
-    let (width, height) = (disparity.width() as usize, disparity.height() as usize);
-    let mut seen = vec![false; width * height];
-    let mut piece = Vec::new();
-    for start in 0..width * height {
-        if seen[start] || disparity.as_raw()[start].is_nan() {
-            continue;
+    let width = disparity.width() as usize;
+    if width == 0 {
+        return;
+    }
+    let near = |a: f32, b: f32| (a - b).abs() <= step_px;
+    // Runs of pixels in a row, joined where they touch the row above: start, end, and the run that stands for the piece.
+    let runs_of = |row: &[f32]| {
+        let mut runs: Vec<[u32; 2]> = Vec::new();
+        let mut x = 0;
+        while x < row.len() {
+            let start = x;
+            x += 1;
+            if row[start].is_nan() {
+                continue;
+            }
+            while x < row.len() && near(row[x], row[x - 1]) {
+                x += 1;
+            }
+            runs.push([start as u32, x as u32]);
         }
-        seen[start] = true;
-        piece.clear();
-        piece.push(start);
-        let mut next = 0;
-        while let Some(&i) = piece.get(next) {
-            next += 1;
-            let (x, value) = (i % width, disparity.as_raw()[i]);
-            let neighbours = [
-                (x > 0).then(|| i - 1),
-                (x + 1 < width).then_some(i + 1),
-                i.checked_sub(width),
-                (i + width < width * height).then_some(i + width),
-            ];
-            for j in neighbours.into_iter().flatten() {
-                if !seen[j] && (disparity.as_raw()[j] - value).abs() <= step_px {
-                    seen[j] = true;
-                    piece.push(j);
+        runs
+    };
+    let rows: Vec<Vec<[u32; 2]>> = disparity.as_raw().par_chunks_exact(width).map(runs_of).collect();
+    let firsts: Vec<usize> = rows.iter().scan(0, |sum, runs| Some(std::mem::replace(sum, *sum + runs.len()))).collect();
+    let mut parents: Vec<u32> = (0..rows.iter().map(Vec::len).sum::<usize>() as u32).collect();
+    for y in 1..rows.len() {
+        let (above, here) = (&disparity.as_raw()[(y - 1) * width..][..width], &disparity.as_raw()[y * width..][..width]);
+        let mut upper = 0;
+        for (k, run) in rows[y].iter().enumerate() {
+            while upper < rows[y - 1].len() && rows[y - 1][upper][1] <= run[0] {
+                upper += 1;
+            }
+            for (j, other) in rows[y - 1].iter().enumerate().skip(upper).take_while(|(_, other)| other[0] < run[1]) {
+                let shared = run[0].max(other[0]) as usize..run[1].min(other[1]) as usize;
+                if shared.into_iter().any(|x| near(above[x], here[x])) {
+                    join(&mut parents, firsts[y] + k, firsts[y - 1] + j);
                 }
             }
         }
-        if piece.len() < area_px {
-            let values: &mut [f32] = disparity;
-            piece.iter().for_each(|&i| values[i] = f32::NAN);
+    }
+    let mut areas = vec![0; parents.len()];
+    for (runs, first) in rows.iter().zip(&firsts) {
+        for (k, run) in runs.iter().enumerate() {
+            areas[root(&mut parents, first + k)] += (run[1] - run[0]) as usize;
         }
     }
+    let values: &mut [f32] = disparity;
+    for ((runs, first), row) in rows.iter().zip(&firsts).zip(values.chunks_exact_mut(width)) {
+        for (k, run) in runs.iter().enumerate() {
+            if areas[root(&mut parents, first + k)] < area_px {
+                row[run[0] as usize..run[1] as usize].fill(f32::NAN);
+            }
+        }
+    }
+}
+
+fn root(parents: &mut [u32], mut i: usize) -> usize {
+    while parents[i] as usize != i {
+        parents[i] = parents[parents[i] as usize];
+        i = parents[i] as usize;
+    }
+    i
+}
+
+fn join(parents: &mut [u32], a: usize, b: usize) {
+    let (a, b) = (root(parents, a), root(parents, b));
+    parents[a.max(b)] = a.min(b) as u32;
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::clouds::correlate::Region;
+    use image::Luma;
+    use nalgebra::Vector2;
 
     #[test]
     fn speckle_filter_meets_opencv() {
@@ -110,17 +182,31 @@ mod tests {
     }
 
     #[test]
-    fn only_confirmed_disparities_stay() {
-        let value = |d: f32| Luma([d]);
-        let mut here = Plane::from_pixel(20, 1, value(f32::NAN));
-        here.put_pixel(10, 0, value(4.2));
-        here.put_pixel(12, 0, value(4.0));
-        let mut there = Plane::from_pixel(20, 1, value(f32::NAN));
-        there.put_pixel(6, 0, value(4.6));
-        there.put_pixel(8, 0, value(7.0));
-        let (kept, confirmed) = consistent(&here, &[(&there, Vector2::new(-1.0, 0.0))], 1.0);
-        assert_eq!(kept.get_pixel(10, 0).0[0], 4.2);
-        assert_eq!(confirmed.iter().filter(|&&c| c == 1).count(), 1);
-        assert!(kept.get_pixel(12, 0).0[0].is_nan());
+    fn the_cheapest_winner_owns_a_place() {
+        // 10, 12 and 13 lead to place 6 of a view on the right, 14 alone to place 10, 3 leaves the picture.
+        let region = Region { x: [0, 20], y: [0, 1] };
+        let mut matches = Matches { region, best: vec![NO_MATCH; 20], cost: vec![[9; 3]; 20], rival: vec![255; 20] };
+        for (x, h, cost) in [(10, 4, 7), (12, 6, 5), (13, 7, 9), (16, 10, 9), (14, 4, 100), (3, 4, 1)] {
+            matches.best[x] = h;
+            matches.cost[x][1] = cost;
+        }
+        let pair = |x: f64, y: f64| Pair {
+            reference: GrayImage::from_pixel(20, 1, Luma([128])),
+            other: GrayImage::from_pixel(20, 30, Luma([128])),
+            step: Vector2::new(x, y),
+        };
+        let at = |bits: &[u8]| [10, 12, 13, 16, 14, 3].map(|i: usize| bits[i]);
+        let confirmed = |matches: &Matches, pairs: &[Pair]| {
+            let owners: Vec<Owners> = pairs.iter().map(|pair| Owners::new(matches, pair)).collect();
+            let mut bits = vec![0; 20];
+            confirm(&matches.best, &owners, 0, 1, &mut bits);
+            bits
+        };
+        // 10 is hidden by 12, 13 is near enough to it, 16 would hide 12 if it were right.
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0)])), [0, 1, 1, 0, 1, 0]);
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)])), [2, 3, 3, 0, 3, 2]);
+        // A farther winner contradicts all that would hide it.
+        (matches.best[8], matches.cost[8][1]) = (2, 1);
+        assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)])), [0, 0, 0, 0, 3, 2]);
     }
 }

@@ -541,7 +541,7 @@ pub(super) mod tests {
                     name: "test".into(),
                     size_px: [640, 480],
                     matrix: Matrix3::new(550.0, 0.0, 320.0, 0.0, 545.0, 240.0, 0.0, 0.0, 1.0),
-                    distortion: [-0.08, 0.01, 1e-3, -5e-4, 0.0],
+                    lens: crate::rig::Lens::BrownConrady([-0.08, 0.01, 1e-3, -5e-4, 0.0, 0.0, 0.0, 0.0]),
                     camera_from_world: nalgebra::Rotation3::new(Vector3::new(1.62, -0.01, 0.02)),
                     translation: Vector3::new(0.02, 0.95, 0.05),
                 };

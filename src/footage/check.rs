@@ -174,7 +174,7 @@ mod tests {
             name: name.into(),
             size_px: [120, 90],
             matrix: Matrix3::new(100.0, 0.0, 60.0, 0.0, 100.0, 45.0, 0.0, 0.0, 1.0),
-            distortion: [0.0; 5],
+            lens: crate::rig::Lens::IDEAL,
             camera_from_world: Rotation3::identity(),
             translation: Vector3::zeros(),
         };

@@ -192,7 +192,7 @@ mod tests {
             name: name.into(),
             size_px: [320, 240],
             matrix: Matrix3::new(280.0, 0.0, 160.0, 0.0, 280.0, 120.0, 0.0, 0.0, 1.0),
-            distortion: [-0.1, 0.02, 0.001, 0.0, 0.0],
+            lens: crate::rig::Lens::BrownConrady([-0.1, 0.02, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0]),
             camera_from_world,
             translation: -(camera_from_world * centre),
         };

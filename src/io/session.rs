@@ -447,7 +447,7 @@ mod tests {
             name: format!("cam_{k:02}"),
             size_px: SIZE,
             matrix: Matrix3::new(50.0, 0.0, 24.0, 0.0, 50.0, 16.0, 0.0, 0.0, 1.0),
-            distortion: [0.0; 5],
+            lens: crate::rig::Lens::IDEAL,
             camera_from_world: Rotation3::identity(),
             translation: Vector3::new(-0.3 * k as f64, 0.0, 0.0),
         };

@@ -269,7 +269,7 @@ pub(crate) mod tests {
                 name: format!("{x} {z}"),
                 size_px,
                 matrix: Matrix3::new(focal, 0.0, 0.5 * size_px[0] as f64 - 0.5, 0.0, focal, 0.5 * size_px[1] as f64 - 0.5, 0.0, 0.0, 1.0),
-                distortion: [-0.08, 0.01, 2e-4, -3e-4, 0.0],
+                lens: crate::rig::Lens::BrownConrady([-0.08, 0.01, 2e-4, -3e-4, 0.0, 0.0, 0.0, 0.0]),
                 camera_from_world,
                 translation: -(camera_from_world * Vector3::new(x, 0.0, z)),
             }

@@ -15,12 +15,14 @@ pub mod curves;
 pub mod figures;
 pub mod maps;
 pub mod overlay;
+pub mod rig;
 
 pub use clouds::cloud_and_body;
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::depth_map;
 pub use overlay::{overlay, strip};
+pub use rig::rig_views;
 
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {

@@ -84,7 +84,7 @@ mod tests {
             name: "c".into(),
             size_px: [320, 240],
             matrix: Matrix3::new(260.0, 0.0, 160.0, 0.0, 260.0, 120.0, 0.0, 0.0, 1.0),
-            distortion: [0.0; 5],
+            lens: crate::rig::Lens::IDEAL,
             camera_from_world: Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
             translation: Vector3::new(0.0, 0.9, 2.6),
         };

@@ -1,11 +1,13 @@
 //! Cameras and rigs of N cameras, three-view rectification.
 
 pub mod camera;
+pub mod lens;
 pub mod rectify;
 
 pub use camera::Camera;
+pub use lens::Lens;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 
 /// Which axis of the world points up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
@@ -61,9 +63,13 @@ pub enum RigError {
     PrincipalPoint { camera: String, cx_px: f64, cy_px: f64, width: u32, height: u32 },
     #[error("{camera}: the rotation is not orthonormal; write it as a Rodrigues vector in radians")]
     Rotation { camera: String },
-    #[error("{first} and {second} are {baseline_m:.1} m apart, which looks like millimetres; divide all translations by 1000")]
+    #[error(
+        "{first} and {second} are {baseline_m:.1} m apart, which looks like millimetres; divide all translations by 1000 (muybridge rig convert FILE --scale 0.001 -o Calib.toml)"
+    )]
     LooksLikeMillimetres { first: String, second: String, baseline_m: f64 },
-    #[error("no two cameras are further apart than {baseline_m:.2e} m, which looks like kilometres; multiply all translations by 1000")]
+    #[error(
+        "no two cameras are further apart than {baseline_m:.2e} m, which looks like kilometres; multiply all translations by 1000 (muybridge rig convert FILE --scale 1000 -o Calib.toml)"
+    )]
     LooksLikeKilometres { baseline_m: f64 },
     #[error("{first} and {second} stand in the same place; one of them has the other's translation")]
     SamePlace { first: String, second: String },
@@ -103,6 +109,24 @@ impl Rig {
         }
     }
 
+    /// The same rig in another world: upright as the first camera stands, x to its right, horizontally away from it along y
+    /// (z-up) or along -z (y-up), zero `height_m` below its centre. For rigs whose world says nothing about up.
+    pub fn upright_at_first_camera(&self, up: Up, height_m: f64) -> Rig {
+        let Some(first) = self.cameras.first() else { return self.clone() };
+        let camera_from_upright = match up {
+            Up::Z => Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
+            Up::Y => Matrix3::new(1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0),
+        };
+        let world_from_upright = first.camera_from_world.inverse() * Rotation3::from_matrix_unchecked(camera_from_upright);
+        let zero_in_world = first.centre() - world_from_upright * up.direction() * height_m;
+        let cameras = self.cameras.iter().map(|c| Camera {
+            camera_from_world: c.camera_from_world * world_from_upright,
+            translation: c.camera_point(&zero_in_world),
+            ..c.clone()
+        });
+        Rig { cameras: cameras.collect(), up }
+    }
+
     /// Refuses rigs that correlation stereo cannot serve: fewer than two cameras, or views from different sides.
     pub fn validate_stereo(&self) -> Result<(), RigError> {
         if self.cameras.len() < 2 {
@@ -128,7 +152,7 @@ fn validate_camera(c: &Camera) -> Result<(), RigError> {
     let camera = c.name.clone();
     let finite: [(&'static str, &[f64]); 4] = [
         ("the camera matrix", c.matrix.as_slice()),
-        ("the distortion", &c.distortion),
+        ("the distortion", c.lens.terms()),
         ("the rotation", c.camera_from_world.matrix().as_slice()),
         ("the translation", c.translation.as_slice()),
     ];
@@ -167,7 +191,6 @@ fn validate_matrix(c: &Camera) -> Result<(), RigError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Rotation3;
 
     fn rig() -> Rig {
         let camera = |name: &str, x: f64, z: f64| {
@@ -176,7 +199,7 @@ mod tests {
                 name: name.into(),
                 size_px: [640, 480],
                 matrix: Matrix3::new(550.0, 0.0, 320.0, 0.0, 550.0, 240.0, 0.0, 0.0, 1.0),
-                distortion: [0.0; 5],
+                lens: Lens::IDEAL,
                 camera_from_world,
                 translation: -(camera_from_world * Vector3::new(x, 0.0, z)),
             }
@@ -219,7 +242,10 @@ mod tests {
     #[test]
     fn impossible_cameras_are_refused() {
         assert!(matches!(changed(|c| c.translation = Vector3::new(0.0, 1.0, 0.0)), Err(RigError::SamePlace { .. })));
-        assert!(matches!(changed(|c| c.distortion[2] = f64::NAN), Err(RigError::NotFinite { what: "the distortion", .. })));
+        assert!(matches!(
+            changed(|c| c.lens = Lens::Fisheye([0.0, f64::NAN, 0.0, 0.0])),
+            Err(RigError::NotFinite { what: "the distortion", .. })
+        ));
         assert!(matches!(changed(|c| c.size_px = [0, 480]), Err(RigError::Size { .. })));
         assert!(matches!(changed(|c| c.matrix[(0, 0)] = 3.6), Err(RigError::Focal { .. })));
         assert!(matches!(changed(|c| c.size_px = [320, 240]), Err(RigError::PrincipalPoint { .. })));
@@ -227,6 +253,25 @@ mod tests {
         let sheared = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0));
         assert!(matches!(changed(|c| c.camera_from_world = sheared), Err(RigError::Rotation { .. })));
         assert_eq!(Rig { cameras: vec![], up: Up::Z }.validate(), Err(RigError::NoCameras));
+    }
+
+    #[test]
+    fn an_upright_world_moves_no_camera_against_another() {
+        let rig = rig();
+        for up in [Up::Y, Up::Z] {
+            let upright = rig.upright_at_first_camera(up, 1.3);
+            assert_eq!(upright.validate(), Ok(()));
+            for (a, b) in upright.baselines_m().iter().zip(rig.baselines_m()) {
+                assert!((a.2 - b.2).abs() < 1e-12);
+            }
+            assert!((upright.cameras[0].centre() - up.direction() * 1.3).norm() < 1e-12);
+            // The third camera is 0.4 m above the first, the second 0.3 m to its right; all look along +y of the old world.
+            assert!((upright.cameras[2].centre() - up.direction() * 1.7).norm() < 1e-12);
+            assert!((upright.cameras[1].centre() - up.direction() * 1.3 - Vector3::x() * 0.3).norm() < 1e-12);
+            let forward = upright.cameras[1].camera_from_world.inverse() * Vector3::z();
+            let expected = if up == Up::Z { Vector3::y() } else { -Vector3::z() };
+            assert!((forward - expected).norm() < 1e-12);
+        }
     }
 
     #[test]

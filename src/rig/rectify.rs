@@ -29,6 +29,10 @@ pub const PLANE_TOLERANCE_M: f64 = 0.002;
 /// Beyond this ratio of the singular values of A an L is too sheared to correlate square windows in it.
 const MAX_SHEAR: f64 = 3.0;
 
+/// Half the field of a rectified picture. A plane stretches what lies further out (4 times here, without bound towards 90
+/// degrees), so that windows of a fisheye camera's rim would match nothing; ordinary lenses do not reach this far.
+const WIDEST_FIELD_DEG: f64 = 60.0;
+
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum RectifyError {
     #[error("cannot rectify {0} cameras together; choose two or three different cameras of the rig")]
@@ -355,18 +359,20 @@ fn choose_canvas(rectification: &mut Rectification) {
     rectification.size_px = [(high.x - low.x) as u32 + 1, (high.y - low.y) as u32 + 1];
 }
 
-/// Rectified box around a view's raw image border.
+/// Rectified box around what a view sees, within [`WIDEST_FIELD_DEG`].
 fn seen_box(rectification: &Rectification, view: usize) -> (Vector2<f64>, Vector2<f64>) {
     let [w, h] = rectification.views[view].camera.size_px.map(|s| f64::from(s) - 1.0);
-    let along = (0..=32).map(|k| f64::from(k) / 32.0);
-    let border = along.flat_map(|t| [(t * w, 0.0), (t * w, h), (0.0, t * h), (w, t * h)]);
+    let share = |k: i32| f64::from(k) / 32.0;
+    // Not the border alone: a wide lens may see nothing there.
+    let grid = (0..=32).flat_map(|i| (0..=32).map(move |k| Point2::new(share(i) * w, share(k) * h)));
+    let reach = Vector2::repeat(rectification.focal_px * WIDEST_FIELD_DEG.to_radians().tan());
     let mut low = Vector2::repeat(f64::INFINITY);
     let mut high = Vector2::repeat(f64::NEG_INFINITY);
-    for p in border.filter_map(|(x, y)| rectification.rectified_pixel(view, &Point2::new(x, y))) {
-        low = low.inf(&p);
-        high = high.sup(&p);
+    for p in grid.filter_map(|raw| rectification.rectified_pixel(view, &raw)) {
+        low = low.inf(&p.sup(&-reach));
+        high = high.sup(&p.inf(&reach));
     }
-    // A border beyond the lens model's reach: fall back to the image's own size around the axis.
+    // Nothing within the lens model's reach: fall back to the image's own size around the axis.
     if low.x.is_finite() { (low, high) } else { (Vector2::new(-w / 2.0, -h / 2.0), Vector2::new(w / 2.0, h / 2.0)) }
 }
 
@@ -467,7 +473,7 @@ pub(crate) mod tests {
                     0.0,
                     1.0,
                 ),
-                distortion: [around(0.1), around(0.02), around(1e-3), around(1e-3), 0.0],
+                lens: crate::rig::Lens::BrownConrady([around(0.1), around(0.02), around(1e-3), around(1e-3), 0.0, 0.0, 0.0, 0.0]),
                 camera_from_world,
                 translation: -(camera_from_world * centre),
             }
@@ -511,6 +517,44 @@ pub(crate) mod tests {
             assert!((steps[1] - Vector2::x()).norm() < 1e-12 && (steps[2] - Vector2::y()).norm() < 1e-12, "{steps:?}");
             assert!((rectification.pixel_from_plane.determinant() - 1.0).abs() < 1e-12);
             check(&rectification, &rig, &mut random);
+        }
+    }
+
+    #[test]
+    fn fisheye_cameras_become_an_ideal_l_too() {
+        let mut random = ChaCha8Rng::seed_from_u64(8);
+        let mut rig = random_rig(&mut random, false);
+        for camera in &mut rig.cameras {
+            // 180 degrees across the width: the rim has no place on a plane.
+            camera.matrix[(0, 0)] *= 0.37;
+            camera.matrix[(1, 1)] *= 0.37;
+            camera.lens = crate::rig::Lens::Fisheye([-0.02, 0.004, -0.003, 0.0005]);
+        }
+        let rectification = rectify(&rig, &[0, 1, 2]).unwrap();
+        check(&rectification, &rig, &mut random);
+        let [width, height] = rectification.size_px;
+        let widest = (2.0 * 1.7321 * rectification.focal_px) as u32 + 3;
+        assert!((640..=widest).contains(&width) && (480..=widest).contains(&height), "{width} x {height}");
+        for view in 0..3 {
+            let camera = &rectification.views[view].camera;
+            let value = |x: f64, y: f64| 128.0 + 60.0 * (x / 17.0).sin() + 50.0 * (y / 23.0).cos();
+            let raw = GrayImage::from_fn(640, 480, |x, y| Luma([value(f64::from(x), f64::from(y)).round() as u8]));
+            let warped = rectification.warp(view, &raw);
+            let mut known = 0;
+            for (u, v, p) in warped.enumerate_pixels().filter(|(_, _, p)| !p.0[0].is_nan()) {
+                let at = Vector2::new(f64::from(u), f64::from(v));
+                // Through the ray and the world point, not through the map.
+                let x = rectification.world_from_pixel(at.x, at.y, rectification.disparity(3.0));
+                let from_reference = rectification.views[view].step * rectification.disparity(3.0);
+                let pixel = rectification.project(view, &x).unwrap() - from_reference;
+                assert!((pixel - at).norm() < 1e-9);
+                let raw_at = camera.project(&(x + camera.centre() - rectification.views[0].camera.centre())).unwrap();
+                if raw_at.x > 2.0 && raw_at.y > 2.0 && raw_at.x < 637.0 && raw_at.y < 477.0 {
+                    assert!((f64::from(p.0[0]) - value(raw_at.x, raw_at.y)).abs() < 1.2);
+                    known += 1;
+                }
+            }
+            assert!(known > 200_000, "view {view} shows {known} pixels");
         }
     }
 
@@ -571,9 +615,9 @@ pub(crate) mod tests {
             let (mut r1, mut r2, mut p1, mut p2, mut q): (core::Mat, core::Mat, core::Mat, core::Mat, core::Mat) = Default::default();
             calib3d::stereo_rectify(
                 &rows(&a.matrix),
-                &mat(&a.distortion, 1),
+                &mat(a.lens.terms(), 1),
                 &rows(&b.matrix),
-                &mat(&b.distortion, 1),
+                &mat(b.lens.terms(), 1),
                 core::Size::new(640, 480),
                 &rows(r.matrix()),
                 &mat(t.as_slice(), 3),
@@ -594,7 +638,7 @@ pub(crate) mod tests {
                 let source = core::Mat::from_slice(&[core::Point2d::new(raw.x, raw.y)]).unwrap().try_clone().unwrap();
                 let mut out = core::Mat::default();
                 let criteria = core::TermCriteria::new(3, 100, 1e-14).unwrap();
-                calib3d::undistort_points_iter(&source, &mut out, &rows(&camera.matrix), &mat(&camera.distortion, 1), r, p, criteria)
+                calib3d::undistort_points_iter(&source, &mut out, &rows(&camera.matrix), &mat(camera.lens.terms(), 1), r, p, criteria)
                     .unwrap();
                 let p = *out.at::<core::Point2d>(0).unwrap();
                 Vector2::new(p.x, p.y)

@@ -1,6 +1,7 @@
 //! `muybridge bench`: tables of accuracy and time beside OpenCV's, in the same process.
 
 mod people;
+mod stereo;
 
 use anyhow::Result;
 
@@ -8,10 +9,13 @@ use anyhow::Result;
 pub enum BenchCommand {
     /// Clouds of people against the true depths and masks of rendered sessions, beside OpenCV's StereoSGBM
     Clouds(people::PeopleArgs),
+    /// Disparities of Middlebury's pairs and the time they take, beside OpenCV's StereoBM and StereoSGBM
+    Stereo(stereo::StereoArgs),
 }
 
 pub fn run(command: &BenchCommand) -> Result<()> {
     match command {
         BenchCommand::Clouds(args) => people::run(args),
+        BenchCommand::Stereo(args) => stereo::run(args),
     }
 }

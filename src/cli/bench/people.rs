@@ -79,7 +79,8 @@ fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
     let (group, _) = full.groups.first().context("the rig has no group")?;
     let order: Vec<usize> = group.views.iter().map(|v| v.index).collect();
     let truths = truths(&session, order[0])?;
-    let frames: Vec<FrameSet> = session.frames().filter(|f| f.as_ref().map_or(true, |f| truths[f.number].is_some())).collect::<Result<_, _>>()?;
+    let frames: Vec<FrameSet> =
+        session.frames().filter(|f| f.as_ref().map_or(true, |f| truths[f.number].is_some())).collect::<Result<_, _>>()?;
     let mut subsets = if order.len() > 2 { vec![order.clone()] } else { Vec::new() };
     subsets.extend(order[1..].iter().map(|&other| vec![order[0], other]));
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
@@ -220,7 +221,8 @@ impl Score {
     }
 
     fn row(&self, session: &str, method: &str) -> String {
-        let percent = |part: usize, whole: usize| if whole == 0 { "-".into() } else { format!("{:.2}", 100.0 * part as f64 / whole as f64) };
+        let percent =
+            |part: usize, whole: usize| if whole == 0 { "-".into() } else { format!("{:.2}", 100.0 * part as f64 / whole as f64) };
         let median = |values: &[f64]| quantile(values.to_vec(), 0.5).unwrap_or(f64::NAN);
         let within: Vec<f64> = self.normalised.iter().copied().filter(|z| z.abs() < 3.0).collect();
         let variance = within.iter().map(|z| z * z).sum::<f64>() / within.len() as f64;
@@ -251,7 +253,9 @@ fn error_picture(group: &Rectification, truth: &Truth, reference: &GrayImage, fo
         let Some(raw) = group.raw_pixel(0, &at) else { return Rgb([grey; 3]) };
         let (d, kept) = (found.matched.get_pixel(u, v).0[0], found.disparity.get_pixel(u, v).0[0]);
         let expected = truth.body_point(group, &raw).and_then(|x| disparity_of(group, &x));
-        let Some(expected) = expected else { return if kept > 0.0 && !truth.on_person(&raw) { Rgb([255, 0, 255]) } else { Rgb([grey; 3]) } };
+        let Some(expected) = expected else {
+            return if kept > 0.0 && !truth.on_person(&raw) { Rgb([255, 0, 255]) } else { Rgb([grey; 3]) };
+        };
         if d.is_nan() {
             return Rgb([255; 3]);
         }
