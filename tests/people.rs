@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use image::GrayImage;
-use muybridge::body::{Placement, PosedSurface, Pose, Shape, place};
+use muybridge::body::{Placement, Pose, PosedSurface, Shape, place};
 use muybridge::clouds::{CloudError, CloudOptions, CloudRig, FrameCloud};
 use muybridge::io::calib_toml::read_rig;
 use muybridge::motion::{Length, play_cycle};
@@ -84,7 +84,10 @@ fn positions(found: &FrameCloud) -> Vec<Vector3<f64>> {
 /// StereoSGBM and reprojectImageTo3D of cameras 0 and 1; points on the true silhouette only, in the world.
 fn semi_global(take: &Take) -> Vec<Vector3<f64>> {
     let [a, b] = [&take.rig.cameras[0], &take.rig.cameras[1]];
-    let matrix = |m: &Matrix3<f64>| Mat::from_slice_2d(&[[m[(0, 0)], m[(0, 1)], m[(0, 2)]], [m[(1, 0)], m[(1, 1)], m[(1, 2)]], [m[(2, 0)], m[(2, 1)], m[(2, 2)]]]).unwrap();
+    let matrix = |m: &Matrix3<f64>| {
+        Mat::from_slice_2d(&[[m[(0, 0)], m[(0, 1)], m[(0, 2)]], [m[(1, 0)], m[(1, 1)], m[(1, 2)]], [m[(2, 0)], m[(2, 1)], m[(2, 2)]]])
+            .unwrap()
+    };
     let b_from_a = b.camera_from_world * a.camera_from_world.inverse();
     let t = b.translation - b_from_a * a.translation;
     let lens = [a, b].map(|c| {
@@ -95,8 +98,23 @@ fn semi_global(take: &Take) -> Vec<Vector3<f64>> {
     let [mut r1, mut r2, mut p1, mut p2, mut q] = [0; 5].map(|_| Mat::default());
     let (rotation, translation) = (matrix(b_from_a.matrix()), Mat::from_slice_2d(&[[t.x], [t.y], [t.z]]).unwrap());
     calib3d::stereo_rectify(
-        &lens[0].0, &lens[0].1, &lens[1].0, &lens[1].1, size, &rotation, &translation, &mut r1, &mut r2, &mut p1, &mut p2, &mut q,
-        calib3d::CALIB_ZERO_DISPARITY, 0.0, size, None, None,
+        &lens[0].0,
+        &lens[0].1,
+        &lens[1].0,
+        &lens[1].1,
+        size,
+        &rotation,
+        &translation,
+        &mut r1,
+        &mut r2,
+        &mut p1,
+        &mut p2,
+        &mut q,
+        calib3d::CALIB_ZERO_DISPARITY,
+        0.0,
+        size,
+        None,
+        None,
     )
     .unwrap();
     let rectified = |k: usize, image: &GrayImage, r: &Mat, p: &Mat| {
@@ -137,13 +155,19 @@ fn clouds_lie_on_the_skin_and_nearer_to_it_than_semi_global_matching() {
         let at = |sorted: &[f64], q: f64| 1e3 * sorted[(q * sorted.len() as f64) as usize];
         println!(
             "distance to the skin, median and 95 %: {:.1}, {:.1} mm of {} points; StereoSGBM {:.1}, {:.1} mm of {}",
-            at(&ours, 0.5), at(&ours, 0.95), ours.len(), at(&theirs, 0.5), at(&theirs, 0.95), theirs.len()
+            at(&ours, 0.5),
+            at(&ours, 0.95),
+            ours.len(),
+            at(&theirs, 0.5),
+            at(&theirs, 0.95),
+            theirs.len()
         );
         assert!(ours.len() > 500 && at(&ours, 0.5) < 0.6 * at(&theirs, 0.5) && at(&ours, 0.95) < at(&theirs, 0.95));
         // The silhouette, and how much of it has points.
         let truth = mask(&take.scene, &take.view(0), &take.pose);
         let found_mask = found.masks[0].as_ref().unwrap();
-        let count = |f: &dyn Fn(bool, bool) -> bool| truth.iter().zip(found_mask.iter()).filter(|(t, m)| f(**t > 0, **m > 0)).count() as f64;
+        let count =
+            |f: &dyn Fn(bool, bool) -> bool| truth.iter().zip(found_mask.iter()).filter(|(t, m)| f(**t > 0, **m > 0)).count() as f64;
         let overlap = count(&|t, m| t && m) / count(&|t, m| t || m);
         println!("intersection over union {overlap:.3}");
         assert!(overlap > 0.9, "{overlap}");
@@ -183,11 +207,16 @@ fn covariances_tell_the_errors_of_depth() {
         let [variance, beyond] = spread(&z);
         println!("seed {seed}, noise {noise}: variance {variance:.2}, beyond 3 sigma {beyond:.3}, {} points", z.len());
         assert!(z.len() > 10_000 && (0.7..1.4).contains(&variance) && beyond < 0.06);
-        if take.rig.cameras[1].centre().x < 0.2 { near.extend(z.clone()) } else { far.extend(z.clone()) }
+        if take.rig.cameras[1].centre().x < 0.2 {
+            near.extend(z.clone())
+        } else {
+            far.extend(z.clone())
+        }
         all.extend(z);
     }
     by_sigma.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let classes: Vec<f64> = by_sigma.chunks(by_sigma.len() / 4 + 1).map(|c| spread(&c.iter().map(|p| p.1).collect::<Vec<_>>())[0]).collect();
+    let classes: Vec<f64> =
+        by_sigma.chunks(by_sigma.len() / 4 + 1).map(|c| spread(&c.iter().map(|p| p.1).collect::<Vec<_>>())[0]).collect();
     println!("all {:.2?}, short rig {:.2?}, lab {:.2?}, classes of sigma {classes:.2?}", spread(&all), spread(&near), spread(&far));
     assert!((0.8..1.2).contains(&spread(&all)[0]) && classes.iter().all(|v| (0.7..1.35).contains(v)));
 }

@@ -85,10 +85,12 @@ mod tests {
     fn a_fattened_step_goes_back_to_its_edge() {
         let views = views();
         let others = [(&views[1].0, views[1].1), (&views[2].0, views[2].1)];
-        let square = |grow: u32| Plane::from_fn(100, 80, |x, y| {
-            let inside = (40 - grow..60 + grow).contains(&x) && (30 - grow..50 + grow).contains(&y);
-            Luma([if inside { 12.0 } else { 6.0 }])
-        });
+        let square = |grow: u32| {
+            Plane::from_fn(100, 80, |x, y| {
+                let inside = (40 - grow..60 + grow).contains(&x) && (30 - grow..50 + grow).contains(&y);
+                Luma([if inside { 12.0 } else { 6.0 }])
+            })
+        };
         let (truth, fat) = (square(0), square(4));
         let wrong = |found: &Plane| found.iter().zip(truth.iter()).filter(|(a, b)| (*a - *b).abs() > 1.0).count();
         let repaired = behind(&views[0].0, &others, &fat);

@@ -45,7 +45,9 @@ pub enum CloudError {
     Images { camera: usize, given: usize },
     #[error("a picture of {camera} is {found:?} pixels, the calibration says {expected:?}; use pictures of the calibrated size")]
     Size { camera: String, found: [u32; 2], expected: [u32; 2] },
-    #[error("the picture of {camera} shows nothing, its grey values vary by {contrast:.1} only; uncover the lens, or leave this camera out of the rig")]
+    #[error(
+        "the picture of {camera} shows nothing, its grey values vary by {contrast:.1} only; uncover the lens, or leave this camera out of the rig"
+    )]
     Blank { camera: String, contrast: f64 },
     #[error("depths from {0} m to {1} m cannot be searched; the nearest must be positive and below the farthest")]
     Depths(f64, f64),
@@ -287,8 +289,7 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
 fn refine(found: &[(StereoView, ViewDisparity)], disparity: Plane) -> Refined {
     let (reference, matched) = &found[0];
     let others: Vec<_> = found[1..].iter().map(|(view, _)| (&view.plane, view.step - reference.step)).collect();
-    let disparity = if std::env::var_os("MB_NOALL").is_some() { disparity } else { confirmed_by_all(found, disparity) };
-    let disparity = if std::env::var_os("MB_NOEDGE").is_some() { disparity } else { edges::behind(&reference.plane, &others, &disparity) };
+    let disparity = edges::behind(&reference.plane, &others, &confirmed_by_all(found, disparity));
     subpixel::refine(&reference.plane, &others, &disparity, &matched.confirmed)
 }
 

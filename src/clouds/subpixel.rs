@@ -111,7 +111,7 @@ pub fn refine(reference: &Plane, others: &[(&Plane, Vector2<f64>)], disparity: &
         }
     }
     let sigma = per_pixel(&now, |i| match fits[i].map(|fit| sigma_px(&fit, jump_px(&now, width as usize, i))) {
-        Some(sigma) if sigma <= std::env::var("MB_SIG").ok().and_then(|v| v.parse().ok()).unwrap_or(LARGEST_SIGMA_PX) => sigma,
+        Some(sigma) if sigma <= LARGEST_SIGMA_PX => sigma,
         _ => f32::NAN,
     });
     now.iter_mut().zip(&sigma).for_each(|(d, s)| *d = if s.is_nan() { f32::NAN } else { *d });
