@@ -5,7 +5,7 @@ use super::correlate::Region;
 use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
 use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
 use super::subpixel::{self, Refined};
-use super::{tidy, triangulate};
+use super::{edges, tidy, triangulate};
 use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
 use image::{GrayImage, ImageBuffer, Luma};
@@ -13,6 +13,9 @@ use nalgebra::Vector3;
 
 /// Room around what changed, px: the reach of the correlation windows and of the outline's blur.
 const MARGIN_PX: usize = 12;
+
+/// Pictures that vary less show nothing but noise, grey levels (standard deviation).
+const LEAST_CONTRAST: f64 = 4.0;
 
 /// How clouds are made.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -42,6 +45,10 @@ pub enum CloudError {
     Images { camera: usize, given: usize },
     #[error("a picture of {camera} is {found:?} pixels, the calibration says {expected:?}; use pictures of the calibrated size")]
     Size { camera: String, found: [u32; 2], expected: [u32; 2] },
+    #[error(
+        "the picture of {camera} shows nothing, its grey values vary by {contrast:.1} only; uncover the lens, or leave this camera out of the rig"
+    )]
+    Blank { camera: String, contrast: f64 },
     #[error("depths from {0} m to {1} m cannot be searched; the nearest must be positive and below the farthest")]
     Depths(f64, f64),
     #[error("the stage was made for {0} views, the rig group has {1}; make it again with this rectification")]
@@ -203,7 +210,7 @@ fn person(
         masks[view.index] = Some(rectification.unwarp(k, &persons[k]));
     }
     let cloud = points(rectification, &found[0].0, &refined, options);
-    let matched = either(&refined.disparity, &found[0].1.disparity);
+    let matched = either(&refined.disparity, &outside(&found[0].1.disparity, &persons[0]));
     FrameCloud { cloud, masks, disparity: refined.disparity, matched, changed: changes[0].changed.clone() }
 }
 
@@ -211,9 +218,21 @@ fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Ve
     let picture = |view: &RectifiedView| {
         let image = images.get(view.index).ok_or(CloudError::Images { camera: view.index, given: images.len() })?;
         let (found, expected) = ([image.width(), image.height()], view.camera.size_px);
-        if found == expected { Ok(image) } else { Err(CloudError::Size { camera: view.camera.name.clone(), found, expected }) }
+        let (camera, contrast) = (view.camera.name.clone(), contrast(image));
+        match (found == expected, contrast >= LEAST_CONTRAST) {
+            (false, _) => Err(CloudError::Size { camera, found, expected }),
+            (true, false) => Err(CloudError::Blank { camera, contrast }),
+            (true, true) => Ok(image),
+        }
     };
     rectification.views.iter().map(picture).collect()
+}
+
+/// Standard deviation of the grey values.
+fn contrast(image: &GrayImage) -> f64 {
+    let n = image.len().max(1) as f64;
+    let mean = image.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+    (image.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n).sqrt()
 }
 
 /// Whole disparities between the farthest and the nearest depth.
@@ -244,6 +263,11 @@ fn inside(disparity: &Plane, mask: &GrayImage) -> Plane {
     ImageBuffer::from_raw(disparity.width(), disparity.height(), values).expect("same size")
 }
 
+fn outside(disparity: &Plane, mask: &GrayImage) -> Plane {
+    let values = disparity.iter().zip(mask.iter()).map(|(&d, &m)| if m == 0 { d } else { f32::NAN }).collect();
+    ImageBuffer::from_raw(disparity.width(), disparity.height(), values).expect("same size")
+}
+
 /// The first plane's values, the second's where it has none.
 fn either(first: &Plane, second: &Plane) -> Plane {
     let values = first.iter().zip(second.iter()).map(|(a, b)| if a.is_nan() { *b } else { *a }).collect();
@@ -265,7 +289,28 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
 fn refine(found: &[(StereoView, ViewDisparity)], disparity: Plane) -> Refined {
     let (reference, matched) = &found[0];
     let others: Vec<_> = found[1..].iter().map(|(view, _)| (&view.plane, view.step - reference.step)).collect();
+    let disparity = edges::behind(&reference.plane, &others, &confirmed_by_all(found, disparity));
     subpixel::refine(&reference.plane, &others, &disparity, &matched.confirmed)
+}
+
+/// Keeps the disparities of the reference that every view confirms which has the place in its picture. A view that finds
+/// something else there mostly contradicts a fattened edge; the places that it cannot see for an occluder are under 1 %.
+fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], mut disparity: Plane) -> Plane {
+    let (reference, matched) = &found[0];
+    for (k, (view, _)) in found[1..].iter().enumerate() {
+        let step = view.step - reference.step;
+        let sees = |u: u32, v: u32, d: f32| {
+            let (x, y) = ((f64::from(u) + step.x * f64::from(d)).round(), (f64::from(v) + step.y * f64::from(d)).round());
+            let inside = x >= 0.0 && y >= 0.0 && x < f64::from(view.plane.width()) && y < f64::from(view.plane.height());
+            inside && !view.plane.get_pixel(x as u32, y as u32).0[0].is_nan()
+        };
+        for ((u, v, d), confirmed) in disparity.enumerate_pixels_mut().zip(&matched.confirmed) {
+            if confirmed >> k & 1 == 0 && sees(u, v, d.0[0]) {
+                d.0[0] = f32::NAN;
+            }
+        }
+    }
+    disparity
 }
 
 fn points(rectification: &Rectification, reference: &StereoView, refined: &Refined, options: &CloudOptions) -> Cloud {

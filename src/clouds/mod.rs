@@ -2,6 +2,7 @@
 
 pub mod cloud;
 pub mod correlate;
+pub mod edges;
 pub mod frame;
 mod lanes;
 pub mod prefilter;

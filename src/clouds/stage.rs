@@ -231,9 +231,25 @@ pub(crate) fn person_mask(
     let mut mask = GrayImage::from_fn(width, height, |x, y| Luma([if set((y * width + x) as usize) { 255 } else { 0 }]));
     mask = regions::box_vote(&mask, 1, 0.5);
     mask = regions::keep_large(&mask, options.smallest_piece_px);
+    mask = bridge(rectification, &mask, &found.disparity, &stage.disparity, options);
     mask = regions::fill_holes(&mask, options.largest_hole_px);
     trim_outline(&mut mask, &changes[k].difference);
     mask
+}
+
+/// Gaps in the mask of up to twice this are bridged, px.
+const BRIDGE_PX: u32 = 4;
+
+/// Joins to the mask what lies between its parts and stands before the stage, though its grey is the stage's: bare skin.
+fn bridge(rectification: &Rectification, mask: &GrayImage, disparity: &Plane, stage: &Plane, options: &StageOptions) -> GrayImage {
+    let closed = regions::close(mask, BRIDGE_PX);
+    let before = |i: usize| {
+        let (d, s) = (disparity.as_raw()[i], stage.as_raw()[i]);
+        d - s > clearance(rectification, s, options.clearance_m).max(options.clearance_px)
+    };
+    let joins = |i: usize| mask.as_raw()[i] != 0 || (closed.as_raw()[i] != 0 && before(i));
+    let width = mask.width() as usize;
+    GrayImage::from_fn(mask.width(), mask.height(), |x, y| Luma([if joins(y as usize * width + x as usize) { 255 } else { 0 }]))
 }
 
 #[derive(Clone, Copy, PartialEq)]

@@ -36,6 +36,9 @@ const EXPOSURE_STEPS: usize = 15;
 /// Gaps in the person up to twice this are closed.
 const CLOSE_RADIUS_PX: u32 = 3;
 
+/// Width of the interval of grey values that count as one surface over time: four standard deviations of a noisy camera.
+const STAGE_GREYS: u8 = 16;
+
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ForegroundOptions {
@@ -68,10 +71,22 @@ pub fn foreground(image: &GrayImage, stage: &GrayImage, options: &ForegroundOpti
     regions::keep_large(&person, view.share_px(SMALLEST_PERSON))
 }
 
-/// The median of each pixel over pictures of one size: the stage, if every pixel shows it in more than half of them.
+/// The stage from pictures of one size with somebody in them: at each pixel the mean of the most frequent grey values.
 ///
-/// Works when the person walks through the view and `frames` are spread over that time ([`spread`]); a person who stays in
-/// one place becomes part of the stage. `None` without pictures or with pictures of different sizes.
+/// Of all intervals of [`STAGE_GREYS`] the one that holds most of the pixel's values (a mean shift of the densest place), so
+/// the stage need not show in half of the pictures, only more often than anything else. Works when the person moves through
+/// the view and `frames` are spread over that time ([`spread`]); who stands still for longer than the place is free becomes
+/// part of the stage. `None` without pictures or with pictures of different sizes.
+///
+/// Tried beside it on the rendered sessions, 25 frames, pixels off by more than 10 grey levels where the person ever was, the
+/// last figures with the person standing still for a third of the clip:
+///
+/// | | p12 | p35 | p39 | p02 | p12 still | p35 still | p39 still | p02 still |
+/// |---|---|---|---|---|---|---|---|---|
+/// | densest interval | 0.0 % | 0.4 % | 0.0 % | 0.0 % | 3.3 % | 6.0 % | 0.8 % | 1.2 % |
+/// | median | 0.9 % | 1.1 % | 0.0 % | 0.0 % | 3.9 % | 11.3 % | 1.0 % | 0.4 % |
+/// | half-sample mode | 0.2 % | 0.7 % | 0.0 % | 0.0 % | 3.6 % | 8.2 % | 1.0 % | 1.2 % |
+/// | OpenCV's MOG2, all frames | 5.3 % | 13.0 % | 2.2 % | 1.5 % | 7.9 % | 19.4 % | 6.1 % | 3.7 % |
 pub fn stage_from_frames(frames: &[GrayImage]) -> Option<GrayImage> {
     let first = frames.first()?;
     if frames.iter().any(|f| f.dimensions() != first.dimensions()) {
@@ -80,9 +95,27 @@ pub fn stage_from_frames(frames: &[GrayImage]) -> Option<GrayImage> {
     let mut values = vec![0u8; frames.len()];
     let pixels = (0..first.len()).map(|i| {
         values.iter_mut().zip(frames).for_each(|(value, frame)| *value = frame.as_raw()[i]);
-        *values.select_nth_unstable(frames.len() / 2).1
+        values.sort_unstable();
+        densest_mean(&values)
     });
     Some(regions::with_pixels(first, pixels.collect()))
+}
+
+/// Mean of the values around the densest interval of a sorted list; the lowest of equally dense ones.
+fn densest_mean(sorted: &[u8]) -> u8 {
+    let (mut low, mut most, mut end) = (0, 0, 0);
+    for (start, &value) in sorted.iter().enumerate() {
+        while end < sorted.len() && sorted[end] - value <= STAGE_GREYS {
+            end += 1;
+        }
+        if end - start > most {
+            (low, most) = (start, end - start);
+        }
+    }
+    let mean = |values: &[u8]| values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len().max(1) as f64;
+    let middle = mean(&sorted[low..low + most]);
+    let near: Vec<u8> = sorted.iter().copied().filter(|&v| (f64::from(v) - middle).abs() <= f64::from(STAGE_GREYS / 2)).collect();
+    mean(&near).round() as u8
 }
 
 /// At most `wanted` positions spread evenly over `count`, first and last included.
@@ -279,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn the_median_over_time_is_the_stage() {
+    fn the_most_frequent_grey_over_time_is_the_stage() {
         let frames: Vec<_> =
             (0..5).map(|k| GrayImage::from_fn(50, 10, |x, _| image::Luma([if x / 10 == k { 250 } else { 40 + (x % 7) as u8 }]))).collect();
         let stage = stage_from_frames(&frames).unwrap();
@@ -288,6 +321,45 @@ mod tests {
         assert!(stage_from_frames(&[GrayImage::new(2, 2), GrayImage::new(2, 3)]).is_none());
         assert_eq!(spread(5, 25), [0, 1, 2, 3, 4]);
         assert_eq!(spread(101, 5), [0, 25, 50, 75, 100]);
+        assert_eq!(densest_mean(&[10, 80, 81, 83, 120, 200, 240]), 81);
+        assert_eq!(densest_mean(&[7]), 7);
+    }
+
+    /// A person of moving texture crosses a stage, stands still for a third of the 60 frames and walks on; noise of 2.
+    fn pausing() -> (Vec<GrayImage>, GrayImage) {
+        let mut random = ChaCha8Rng::seed_from_u64(11);
+        let stage = |x: f64, y: f64| 120.0 + 25.0 * (x / 9.0).sin() * (y / 7.0).cos();
+        let mut picture = |place: f64, noise: f64| {
+            GrayImage::from_fn(160, 60, |x, y| {
+                let (x, y) = (f64::from(x), f64::from(y));
+                let body = 110.0 + 45.0 * ((x - place) / 3.0).sin() * (y / 4.0).cos();
+                let grey = if (x - place).abs() < 12.0 && y > 8.0 { body } else { stage(x, y) };
+                let normal = (0..12).map(|_| random.random::<f64>() - 0.5).sum::<f64>();
+                image::Luma([(grey + noise * normal).round() as u8])
+            })
+        };
+        let place = |k: usize| if k < 20 { 4.0 * k as f64 } else { 80.0 + 4.0 * (k as f64 - 40.0).max(0.0) };
+        ((0..60).map(|k| picture(place(k), 2.0)).collect(), picture(-99.0, 0.0))
+    }
+
+    #[test]
+    fn who_stands_still_for_a_third_of_the_time_does_not_become_the_stage() {
+        use opencv::{core::Mat, prelude::*, video};
+        let (frames, empty) = pausing();
+        let error = |stage: &[u8]| stage.iter().zip(empty.iter()).filter(|(a, b)| a.abs_diff(**b) > 10).count() as f64 / empty.len() as f64;
+        let chosen: Vec<GrayImage> = spread(60, 25).into_iter().map(|k| frames[k].clone()).collect();
+        let ours = error(&stage_from_frames(&chosen).unwrap());
+        let mut mixture = video::create_background_subtractor_mog2(60, 16.0, false).unwrap();
+        for frame in &frames {
+            let picture = Mat::new_rows_cols_with_data(60, 160, frame.as_raw()).unwrap();
+            BackgroundSubtractorMOG2Trait::apply(&mut mixture, &picture, &mut Mat::default(), -1.0).unwrap();
+        }
+        let mut background = Mat::default();
+        BackgroundSubtractorMOG2TraitConst::get_background_image(&mixture, &mut background).unwrap();
+        let theirs = error(background.data_bytes().unwrap());
+        let middle = error(&frames[30]);
+        println!("pixels off: {ours:.4}, MOG2 {theirs:.4}, one frame {middle:.4}");
+        assert!(ours < 0.01 && ours < theirs && middle > 0.1);
     }
 
     #[test]
@@ -352,7 +424,7 @@ mod tests {
             let frames: Vec<_> = spread(52, 25).iter().map(|i| load(&session.join(format!("cam_00/{i:06}.jpg")))).collect();
             let stage = stage_from_frames(&frames).unwrap();
             let [recall, precision, iou] = mean_scores(&session, &masks, &stage, &ForegroundOptions::default());
-            println!("median stage: {:.3?}", [recall, precision, iou]);
+            println!("stage from frames: {:.3?}", [recall, precision, iou]);
             assert!(recall > 0.9 && precision > 0.82);
         }
     }

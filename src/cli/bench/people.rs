@@ -40,10 +40,25 @@ type DepthSteps = ImageBuffer<Luma<u16>, Vec<u16>>;
 
 pub fn run(args: &PeopleArgs) -> Result<()> {
     println!("depth errors on the body's pixels; share of points off the person (far: more than {FAR_PX} px) before and after cleaning;");
+    println!("common: median mm and >1px share of the method and of all views, on the pixels that both have;");
     println!("z: variance of depth error / sigma within 3 sigma, {} threads, OpenCV 1", rayon::current_num_threads());
     println!(
-        "{:<22}{:<18}{:>8}{:>9}{:>8}{:>9}{:>8}{:>9}{:>7}{:>7}{:>6}{:>7}{:>8}",
-        "session", "method", "med mm", "density", ">1px", "kept", ">1px", "off bef", "aft", "far", "z", "IoU", "ms"
+        "{:<22}{:<18}{:>8}{:>9}{:>8}{:>9}{:>8}{:>9}{:>7}{:>7}{:>6}{:>7}{:>8}{:>12}{:>12}",
+        "session",
+        "method",
+        "med mm",
+        "density",
+        ">1px",
+        "kept",
+        ">1px",
+        "off bef",
+        "aft",
+        "far",
+        "z",
+        "IoU",
+        "ms",
+        "common: it",
+        "all views"
     );
     args.sessions.iter().try_for_each(|folder| bench(folder, args.pictures.as_deref()).with_context(|| folder.display().to_string()))
 }
@@ -69,6 +84,8 @@ struct Score {
     both: usize,
     either: usize,
     seconds: Vec<f64>,
+    /// Errors in metres and px of this method and of all views together, where both have a disparity.
+    common: Vec<[[f64; 2]; 2]>,
 }
 
 fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
@@ -84,20 +101,22 @@ fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
     let mut subsets = if order.len() > 2 { vec![order.clone()] } else { Vec::new() };
     subsets.extend(order[1..].iter().map(|&other| vec![order[0], other]));
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
+    let mut together: Vec<FrameCloud> = Vec::new();
     for cameras in subsets {
         let rig = Rig { cameras: cameras.iter().map(|&k| session.rig.cameras[k].clone()).collect(), up: session.rig.up };
         let stage: Vec<GrayImage> = cameras.iter().map(|&k| stages[k].clone()).collect();
         let ready = CloudRig::new(&rig, Some(&stage), &options)?;
         let label = cameras.iter().map(|&k| session.rig.cameras[k].name.trim_start_matches("cam_")).collect::<Vec<_>>().join("-");
         let (mut ours, mut sgbm) = (Score::default(), Score::default());
-        for frame in &frames {
+        for (i, frame) in frames.iter().enumerate() {
             interrupt::check()?;
             let Some(truth) = &truths[frame.number] else { continue };
             let images: Vec<GrayImage> = cameras.iter().map(|&k| frame.images[k].clone()).collect();
             let begun = Instant::now();
             let found = ready.frame(&images, &options)?;
             ours.seconds.push(begun.elapsed().as_secs_f64());
-            ours.add(&ready.groups[0].0, truth, &found.matched, &found);
+            let full = together.get(i).map(|all| (group, &all.matched));
+            ours.add(&ready.groups[0].0, truth, &found.matched, &found, full);
             ours.add_cloud(&ready.groups[0].0, truth, &found);
             if let (Some(pictures), true) = (pictures, truth.depth.is_some()) {
                 let path = pictures.join(format!("{name}_{label}_{:06}.png", frame.number));
@@ -108,7 +127,9 @@ fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
                 let begun = Instant::now();
                 let theirs = semi_global(&ready.groups[0].0, &images, options.nearest_m)?;
                 sgbm.seconds.push(begun.elapsed().as_secs_f64());
-                sgbm.add(&ready.groups[0].0, truth, &theirs, &found);
+                sgbm.add(&ready.groups[0].0, truth, &theirs, &found, full);
+            } else {
+                together.push(found);
             }
         }
         println!("{}", ours.row(&name, &format!("ours {label}")));
@@ -172,9 +193,20 @@ fn disparity_of(group: &Rectification, x: &Vector3<f64>) -> Option<f64> {
     Some((group.project(1, x)? - group.project(0, x)?).dot(&step) / step.norm_squared())
 }
 
+/// Errors in metres and px of a plane of disparities at a raw pixel that shows `x`.
+fn errors_at(group: &Rectification, plane: &Plane, raw: &Point2<f64>, x: &Vector3<f64>) -> Option<[f64; 2]> {
+    let at = group.rectified_pixel(0, raw)?.map(f64::round);
+    let inside = at.x >= 0.0 && at.y >= 0.0 && at.x < f64::from(plane.width()) && at.y < f64::from(plane.height());
+    let d = if inside { f64::from(plane.get_pixel(at.x as u32, at.y as u32).0[0]) } else { f64::NAN };
+    let estimate = group.world_from_pixel(at.x, at.y, d);
+    let camera = &group.views[0].camera;
+    let error_m = (camera.camera_point(&estimate).z - camera.camera_point(x).z).abs();
+    (d > 0.0).then_some([error_m, (d - disparity_of(group, x)?).abs()])
+}
+
 impl Score {
     /// Disparities of the whole reference view, and what cleaning left of ours.
-    fn add(&mut self, group: &Rectification, truth: &Truth, matched: &Plane, found: &FrameCloud) {
+    fn add(&mut self, group: &Rectification, truth: &Truth, matched: &Plane, found: &FrameCloud, all: Option<(&Rectification, &Plane)>) {
         let camera = &group.views[0].camera;
         for (u, v, d) in matched.enumerate_pixels() {
             let at = Vector2::new(f64::from(u), f64::from(v));
@@ -189,9 +221,12 @@ impl Score {
             let off = |d: f32| (f64::from(d) - expected).abs() > 1.0;
             if d.0[0] > 0.0 {
                 let estimate = group.world_from_pixel(at.x, at.y, d.0[0].into());
-                self.errors_m.push((camera.camera_point(&estimate).z - camera.camera_point(&x).z).abs());
+                let error_m = (camera.camera_point(&estimate).z - camera.camera_point(&x).z).abs();
+                self.errors_m.push(error_m);
                 self.matched += 1;
                 self.matched_off += usize::from(off(d.0[0]));
+                let mine = [error_m, (f64::from(d.0[0]) - expected).abs()];
+                self.common.extend(all.and_then(|(full, plane)| Some([mine, errors_at(full, plane, &raw, &x)?])));
             }
             let kept = found.disparity.get_pixel(u, v).0[0];
             self.kept += usize::from(kept > 0.0);
@@ -224,10 +259,18 @@ impl Score {
         let percent =
             |part: usize, whole: usize| if whole == 0 { "-".into() } else { format!("{:.2}", 100.0 * part as f64 / whole as f64) };
         let median = |values: &[f64]| quantile(values.to_vec(), 0.5).unwrap_or(f64::NAN);
+        let common = |k: usize| -> String {
+            if self.common.is_empty() {
+                return "-".into();
+            }
+            let errors_m: Vec<f64> = self.common.iter().map(|c| c[k][0]).collect();
+            let off = self.common.iter().filter(|c| c[k][1] > 1.0).count();
+            format!("{:.2} {}", 1e3 * median(&errors_m), percent(off, self.common.len()))
+        };
         let within: Vec<f64> = self.normalised.iter().copied().filter(|z| z.abs() < 3.0).collect();
         let variance = within.iter().map(|z| z * z).sum::<f64>() / within.len() as f64;
         format!(
-            "{session:<22}{method:<18}{:>8.2}{:>9}{:>8}{:>9}{:>8}{:>9}{:>7}{:>7}{:>6}{:>7}{:>8.1}",
+            "{session:<22}{method:<18}{:>8.2}{:>9}{:>8}{:>9}{:>8}{:>9}{:>7}{:>7}{:>6}{:>7}{:>8.1}{:>12}{:>12}",
             1e3 * median(&self.errors_m),
             percent(self.matched, self.body),
             percent(self.matched_off, self.matched),
@@ -238,7 +281,9 @@ impl Score {
             percent(self.after[2], self.after[0]),
             if within.is_empty() { "-".into() } else { format!("{variance:.2}") },
             if self.either > 0 { format!("{:.3}", self.both as f64 / self.either as f64) } else { "-".into() },
-            1e3 * median(&self.seconds)
+            1e3 * median(&self.seconds),
+            common(0),
+            common(1)
         )
     }
 }
