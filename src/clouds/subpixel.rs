@@ -61,9 +61,9 @@ const LEAST_VARIANCE: f32 = 1.0;
 /// Reach of j in (3).
 const JUMP_REACH_PX: usize = 5;
 /// a, b and c of (3).
-const NOISE_SHARE: f32 = 0.36;
-const MISFIT_SHARE: f32 = 0.036;
-const JUMP_SHARE: f32 = 0.0097;
+const NOISE_SHARE: f32 = 0.40;
+const MISFIT_SHARE: f32 = 0.040;
+const JUMP_SHARE: f32 = 0.0107;
 /// Disparities with a larger σ are dropped, and those for which no step was believed: beside edges, and without texture.
 const LARGEST_SIGMA_PX: f32 = 0.35;
 

@@ -352,10 +352,10 @@ mod tests {
         let mut mixture = video::create_background_subtractor_mog2(60, 16.0, false).unwrap();
         for frame in &frames {
             let picture = Mat::new_rows_cols_with_data(60, 160, frame.as_raw()).unwrap();
-            BackgroundSubtractorMOG2Trait::apply(&mut mixture, &picture, &mut Mat::default(), -1.0).unwrap();
+            <_ as BackgroundSubtractorMOG2Trait>::apply(&mut mixture, &picture, &mut Mat::default(), -1.0).unwrap();
         }
         let mut background = Mat::default();
-        BackgroundSubtractorMOG2TraitConst::get_background_image(&mixture, &mut background).unwrap();
+        BackgroundSubtractorTraitConst::get_background_image(&mixture, &mut background).unwrap();
         let theirs = error(background.data_bytes().unwrap());
         let middle = error(&frames[30]);
         println!("pixels off: {ours:.4}, MOG2 {theirs:.4}, one frame {middle:.4}");
