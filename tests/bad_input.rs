@@ -204,12 +204,10 @@ fn an_empty_stage_is_refused() {
 }
 
 #[test]
-fn a_calibration_that_does_not_fit_is_a_warning() {
+fn a_calibration_that_does_not_fit_is_refused() {
     let (_study, session) = session("png");
     fs::write(session.join("Calib.toml"), calib().replacen("[0.0, 150.0, 60.0]", "[0.0, 150.0, 66.0]", 1)).unwrap();
-    let output = check(&session);
-    let text = String::from_utf8(output.stdout).unwrap();
-    assert!(output.status.success() && text.contains("warning: cam_00 and cam_01: calibration does not fit these pictures"), "{text}");
+    refused(&session, &["walk: cam_00", "against the calibration: calibrate again"]);
 }
 
 #[test]

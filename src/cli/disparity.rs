@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result, bail};
 use image::GrayImage;
-use muybridge::clouds::correlate::Region;
+use muybridge::clouds::correlate::{MOST_HYPOTHESES, Region};
 use muybridge::clouds::stereo::{StereoOptions, StereoView, match_view};
 use muybridge::io::pfm::write_pfm;
 use muybridge::rig::rectify::Plane;
@@ -57,6 +57,11 @@ pub fn run(args: &DisparityArgs) -> Result<()> {
             size.0,
             size.1
         );
+    }
+    let longest = views.iter().map(|v| v.2.amax()).fold(1.0, f64::max);
+    if f64::from(args.max_disparity) * longest > MOST_HYPOTHESES as f64 {
+        let most = (MOST_HYPOTHESES as f64 / longest) as usize;
+        bail!("--max-disparity {} is more than can be searched with these baselines; give at most {most}", args.max_disparity);
     }
     let views: Vec<StereoView> = views.iter().map(|(_, image, step)| StereoView { plane: plane(image), step: *step }).collect();
     let all = Region { x: [0, size.0 as usize], y: [0, size.1 as usize] };

@@ -1,5 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod bench;
+mod board;
+mod calibrate;
 mod check;
 mod clouds;
 mod demo;
@@ -34,11 +36,13 @@ enum Command {
     Demo(demo::DemoArgs),
     /// What is wrong with a session and what to do, before any long work
     Check(check::CheckArgs),
+    /// A rig from pictures of a chessboard or ChArUco board
+    Calibrate(calibrate::CalibrateArgs),
     /// The person's point cloud in every frame of a session, as PLY files
     Clouds(clouds::CloudsArgs),
     /// Disparities of one rectified pair or triple of pictures
     Disparity(disparity::DisparityArgs),
-    /// Rig files: in words and a picture, and from one form to another
+    /// Rig files in words and a picture and from one form to another; boards to calibrate with
     #[command(subcommand)]
     Rig(rig::RigCommand),
     /// Motion databases and their PCA models
@@ -74,6 +78,7 @@ pub fn run(cli: Cli) -> Result<()> {
     match cli.command {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Clouds(args) => clouds::run(&args),
         Command::Disparity(args) => disparity::run(&args),
         Command::Track(args) => track::run(&args),

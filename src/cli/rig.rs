@@ -1,5 +1,6 @@
 //! `muybridge rig`: rig files in words and a picture, and from one form to another.
 
+use super::board;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +23,8 @@ pub enum RigCommand {
     Show(ShowArgs),
     /// A rig file in another form: Calib.toml or OpenCV's YAML
     Convert(ConvertArgs),
+    /// A calibration board to print
+    Board(board::BoardArgs),
 }
 
 #[derive(Args)]
@@ -95,6 +98,7 @@ pub fn run(command: &RigCommand) -> Result<()> {
     match command {
         RigCommand::Show(args) => show(args),
         RigCommand::Convert(args) => convert(args),
+        RigCommand::Board(args) => board::run(args),
     }
 }
 

@@ -30,6 +30,9 @@
 //! | kept, 2 / 4 / 5 / 8 paths                                   | 0.65 / 0.62 / 0.60 / 0.62 | 0.94 to 0.95 | 0.57 to 0.63 |
 //! | kept, costs in 1/8 or 1 grey level                          | 0.59 / 0.59 | 0.95 | 0.57 / 0.59 |
 
+// The indexed loops over blocks are what the compiler unrolls.
+#![allow(clippy::needless_range_loop)]
+
 use super::lanes::{LANES, Lanes};
 use image::GrayImage;
 use nalgebra::Vector2;
@@ -42,8 +45,8 @@ const TRUNCATION: u8 = 24;
 const OCCLUSION_PENALTY: u8 = 16;
 /// P1 and P2 of (4), half grey levels.
 pub(super) const STEP_PENALTIES: [u8; 2] = [12, 32];
-/// Rows of a band; more are slower to share out, fewer warm up more often.
-const BAND_ROWS: usize = 120;
+/// Rows of a band; more are slower to share out (frames are shared out too), fewer warm up more often.
+const BAND_ROWS: usize = 240;
 /// Rows until a path has forgotten where it began.
 const WARM_UP_ROWS: usize = 6;
 /// Largest r of (3).
@@ -485,15 +488,27 @@ impl<const N: usize> Rows<N> {
     }
 }
 
-/// A row of the reference and the hypotheses of its pixels, for each pair.
+/// A row of the reference for each pair.
 struct CostRows<'a> {
-    first: (&'a [u8], (&'a [u8], isize, isize)),
-    second: Option<(&'a [u8], (&'a [u8], isize, isize))>,
+    first: CostRow<'a>,
+    second: Option<CostRow<'a>>,
+}
+
+/// Values of the reference, and where the hypotheses of its pixels lie.
+struct CostRow<'a> {
+    values: &'a [u8],
+    data: &'a [u8],
+    /// Place of the first pixel's hypotheses, and distance to the next pixel's.
+    origin: isize,
+    per_x: isize,
 }
 
 impl<'a> CostRows<'a> {
     fn new(job: &'a Job, y: usize, [scratch, second_scratch]: [&'a mut Vec<u8>; 2]) -> Self {
-        let of = |pair: &'a PairRows, scratch| (pair.reference_row(y, job.width), pair.candidates.row(y, job.width, job.depth, scratch));
+        let of = |pair: &'a PairRows, scratch| {
+            let (data, origin, per_x) = pair.candidates.row(y, job.width, job.depth, scratch);
+            CostRow { values: pair.reference_row(y, job.width), data, origin, per_x }
+        };
         Self { first: of(&job.pairs[0], scratch), second: job.pairs.get(1).map(|pair| of(pair, second_scratch)) }
     }
 
@@ -520,9 +535,9 @@ impl<'a> CostRows<'a> {
 
 /// Equation (1) at pixel x.
 #[inline(always)]
-fn truncated<L: Lanes, const N: usize>((values, (data, origin, per_x)): &(&[u8], (&[u8], isize, isize)), x: usize) -> [L; N] {
-    let value = L::splat(values[x]);
-    let hypotheses = &data[(origin + x as isize * per_x) as usize..][..N * LANES].as_chunks::<LANES>().0[..N];
+fn truncated<L: Lanes, const N: usize>(row: &CostRow, x: usize) -> [L; N] {
+    let value = L::splat(row.values[x]);
+    let hypotheses = &row.data[(row.origin + x as isize * row.per_x) as usize..][..N * LANES].as_chunks::<LANES>().0[..N];
     let mut cost = [value; N];
     for k in 0..N {
         cost[k] = value.abs_diff(L::load(&hypotheses[k])).min(L::splat(TRUNCATION));

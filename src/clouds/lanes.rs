@@ -3,6 +3,9 @@
 //! Kernels are written once over [`Lanes`] and must be `#[inline(always)]` up to the function that enables AVX2; outside of it
 //! the intrinsics would be calls.
 
+// Indexed loops of fixed length are what the compiler turns into vectors.
+#![allow(clippy::needless_range_loop)]
+
 /// Number of bytes in a block.
 pub const LANES: usize = 32;
 

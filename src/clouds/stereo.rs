@@ -5,7 +5,6 @@ use super::prefilter;
 use super::subpixel::equiangular;
 use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
-use image::Luma;
 use nalgebra::Vector2;
 use rayon::prelude::*;
 
@@ -15,7 +14,7 @@ use rayon::prelude::*;
 pub struct StereoOptions {
     /// Half-width of the correlation window, px. 1 is noisy, 4 fattens limbs of 20 px.
     pub radius: usize,
-    /// How much dearer the best rival must be, as a fraction of the winner's cost.
+    /// How much dearer the best rival must be, as a fraction of the winner's cost; twice that where a view does not confirm.
     pub uniqueness: f32,
     /// Tolerance of the check between views, px.
     pub consistency_px: f32,
@@ -75,7 +74,7 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let matches = correlate(&pairs, region, hypotheses, options.radius);
     let owners: Vec<Owners> = pairs.par_iter().map(|pair| Owners::new(&matches, pair)).collect();
     let (width, height) = here.plane.dimensions();
-    let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    let mut disparity = Plane::from_raw(width, height, vec![f32::NAN; (width * height) as usize]).expect("one value per pixel");
     let mut confirmed = vec![0; (width * height) as usize];
     let (tolerance, px) = ((f64::from(options.consistency_px) * per_px) as u16, (1.0 / per_px) as f32);
     let rows = disparity.par_chunks_exact_mut(width.max(1) as usize).zip(confirmed.par_chunks_exact_mut(width.max(1) as usize));
@@ -86,7 +85,8 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
         let costs = matches.cost[row.clone()].iter().zip(&matches.rival[row]);
         let found = best.iter().zip(costs).zip(confirmed).zip(&mut values[region.x[0]..region.x[1]]);
         for (((best, (cost, rival)), confirmed), value) in found {
-            if *confirmed != 0 && validate::unique(cost[1], *rival, options.uniqueness) {
+            let ratio = if confirmed.count_ones() as usize == owners.len() { options.uniqueness } else { 2.0 * options.uniqueness };
+            if *confirmed != 0 && validate::unique(cost[1], *rival, ratio) {
                 *value = equiangular(*cost).map_or(f32::NAN, |offset| (f32::from(*best) + offset) * px);
             }
         }
@@ -102,7 +102,7 @@ fn others_of(views: &[StereoView], k: usize) -> impl Iterator<Item = &StereoView
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::GrayImage;
+    use image::{GrayImage, Luma};
     use std::path::Path;
 
     /// A band-limited texture without repetition in view.

@@ -22,12 +22,36 @@ const WINDOW_RADIUS_PX: i64 = 6;
 const BAND_PX: i64 = 20;
 /// Matches below this correlation are chance; noise of 2 grey levels on weak texture leaves 0.9.
 const LOWEST_CORRELATION: f64 = 0.85;
+/// First the band is sought at this step; texture finer than two of it would be missed.
+const COARSE_PX: usize = 2;
+/// What correlation a step aside leaves of a match.
+const LOWEST_COARSE: f64 = 0.4;
 /// How far the way back may end from the corner.
 const RETURN_PX: f64 = 2.0;
 /// The nearest depth searched, in baselines.
 const NEAREST_BASELINES: f64 = 5.0;
 /// Corners weaker than this share of the strongest are no corners.
 const WEAKEST_CORNER: f32 = 0.01;
+
+/// A corner of one picture found in another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Match {
+    pub first_px: Point2<f64>,
+    pub second_px: Point2<f64>,
+    /// Unit normal of the epipolar curve in the second picture.
+    pub normal: Vector2<f64>,
+    /// Signed distance from the curve along the normal.
+    pub distance_px: f64,
+}
+
+/// What two cameras have in common in sets of simultaneous pictures.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PairMatches {
+    pub first: usize,
+    pub second: usize,
+    /// One list per set.
+    pub sets: Vec<Vec<Match>>,
+}
 
 /// How two cameras fit together.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,61 +64,65 @@ pub struct PairResidual {
     pub median_px: Option<f64>,
 }
 
-/// Residuals of every pair of cameras, pooled over sets of simultaneous pictures (one per camera). With `masks`, of the same
-/// form, only corners inside the first camera's mask count.
-pub fn epipolar_residuals(rig: &Rig, sets: &[&[GrayImage]], masks: Option<&[Vec<GrayImage>]>) -> Vec<PairResidual> {
+impl From<&PairMatches> for PairResidual {
+    fn from(pair: &PairMatches) -> PairResidual {
+        let distances: Vec<f64> = pair.sets.iter().flatten().map(|m| m.distance_px.abs()).collect();
+        PairResidual { first: pair.first, second: pair.second, matches: distances.len(), median_px: quantile(distances, 0.5) }
+    }
+}
+
+/// Matches of every pair of cameras in sets of simultaneous pictures (one per camera). With `masks`, of the same form,
+/// only corners inside the first camera's mask count.
+pub fn pair_matches(rig: &Rig, sets: &[&[GrayImage]], masks: Option<&[Vec<GrayImage>]>) -> Vec<PairMatches> {
     let pair = |(first, second, baseline_m): (usize, usize, f64)| {
         let of_set = |(k, set): (usize, &&[GrayImage])| match (set.get(first), set.get(second)) {
             (Some(a), Some(b)) => {
                 let mask = masks.and_then(|m| m.get(k)?.get(first));
-                residuals(&rig.cameras[first], &rig.cameras[second], [a, b], mask, NEAREST_BASELINES * baseline_m)
+                matches(&rig.cameras[first], &rig.cameras[second], [a, b], mask, NEAREST_BASELINES * baseline_m)
             }
             _ => Vec::new(),
         };
-        let distances: Vec<f64> = sets.iter().enumerate().flat_map(of_set).map(f64::abs).collect();
-        PairResidual { first, second, matches: distances.len(), median_px: quantile(distances, 0.5) }
+        PairMatches { first, second, sets: sets.iter().enumerate().map(of_set).collect() }
     };
     rig.baselines_m().into_iter().map(pair).collect()
 }
 
-/// Signed distances of the matches of one pair of pictures from their curves.
-fn residuals(from: &Camera, to: &Camera, images: [&GrayImage; 2], mask: Option<&GrayImage>, nearest_m: f64) -> Vec<f64> {
+/// Matches of one pair of pictures.
+fn matches(from: &Camera, to: &Camera, images: [&GrayImage; 2], mask: Option<&GrayImage>, nearest_m: f64) -> Vec<Match> {
     let inside = |p: &(u32, u32)| mask.is_none_or(|m| m.get_pixel_checked(p.0, p.1).is_some_and(|v| v.0[0] > 0));
     let corners: Vec<_> = corners(images[0]).into_iter().filter(inside).collect();
-    let residual = |&(x, y): &(u32, u32)| {
+    let found = |&(x, y): &(u32, u32)| {
         let corner = Point2::new(f64::from(x), f64::from(y));
-        let (there, distance) = best_match(from, to, images, corner, nearest_m)?;
-        let (back, _) = best_match(to, from, [images[1], images[0]], there, nearest_m)?;
-        ((back - corner).norm() <= RETURN_PX).then_some(distance)
+        let there = best_match(from, to, images, corner, nearest_m)?;
+        let back = best_match(to, from, [images[1], images[0]], there.second_px, nearest_m)?;
+        ((back.second_px - corner).norm() <= RETURN_PX).then_some(there)
     };
-    corners.par_iter().map(residual).collect::<Vec<_>>().into_iter().flatten().collect()
+    corners.par_iter().map(found).collect::<Vec<_>>().into_iter().flatten().collect()
 }
 
-/// The best match so far: a pixel, the curve's point beside it and the normal there.
-struct Candidate {
-    correlation: f64,
-    at: Option<(i64, i64, Point2<f64>, Vector2<f64>)>,
-}
-
-/// The best place of a pixel's surroundings in the other picture, and its signed distance from the epipolar curve.
-fn best_match(from: &Camera, to: &Camera, images: [&GrayImage; 2], pixel: Point2<f64>, nearest_m: f64) -> Option<(Point2<f64>, f64)> {
+/// The best place of a pixel's surroundings in the other picture: over every second pixel of the band, then around the best.
+fn best_match(from: &Camera, to: &Camera, images: [&GrayImage; 2], pixel: Point2<f64>, nearest_m: f64) -> Option<Match> {
     let rounded = Point2::new(pixel.x.round(), pixel.y.round());
     let window = Window::at(images[0], rounded.x as i64, rounded.y as i64)?;
-    let score = |x: i64, y: i64| Window::at(images[1], x, y).map(|other| window.correlation(&other));
-    let mut best = Candidate { correlation: LOWEST_CORRELATION, at: None };
-    for (point, normal) in curve(from, to, &rounded, nearest_m)? {
-        for offset in -BAND_PX..=BAND_PX {
-            let at = point + normal * offset as f64;
+    let score = |x: i64, y: i64| Window::at(images[1], x, y).map_or(-1.0, |other| window.correlation(&other));
+    let band = || (-BAND_PX..=BAND_PX).step_by(COARSE_PX);
+    let (mut highest, mut best) = (LOWEST_COARSE, None);
+    for (point, normal) in curve(from, to, &rounded, nearest_m)?.into_iter().step_by(COARSE_PX) {
+        for at in band().map(|offset| point + normal * offset as f64) {
             let (x, y) = (at.x.round() as i64, at.y.round() as i64);
-            if let Some(correlation) = score(x, y).filter(|c| *c > best.correlation) {
-                best = Candidate { correlation, at: Some((x, y, point, normal)) };
+            let correlation = score(x, y);
+            if correlation > highest {
+                (highest, best) = (correlation, Some((x, y, point, normal)));
             }
         }
     }
-    let (x, y, point, normal) = best.at?;
-    let shift = |before: Option<f64>, after: Option<f64>| peak(before.unwrap_or(0.0), best.correlation, after.unwrap_or(0.0));
+    let (x, y, point, normal) = best?;
+    let reach = COARSE_PX as i64;
+    let around = (y - reach..=y + reach).flat_map(|y| (x - reach..=x + reach).map(move |x| (x, y)));
+    let (x, y, top) = around.map(|(x, y)| (x, y, score(x, y))).max_by(|a, b| a.2.total_cmp(&b.2))?;
+    let shift = |before: f64, after: f64| peak(before.max(0.0), top, after.max(0.0));
     let place = Point2::new(x as f64 + shift(score(x - 1, y), score(x + 1, y)), y as f64 + shift(score(x, y - 1), score(x, y + 1)));
-    Some((place, (place - point).dot(&normal)))
+    (top > LOWEST_CORRELATION).then(|| Match { first_px: pixel, second_px: place, normal, distance_px: (place - point).dot(&normal) })
 }
 
 /// Points 1 px apart along the epipolar curve of a pixel, each with the unit normal there.
@@ -185,6 +213,10 @@ mod tests {
     use crate::rig::Up;
     use nalgebra::{Matrix3, Rotation3, Vector3};
 
+    fn residuals(rig: &Rig, images: &[GrayImage], masks: Option<&[Vec<GrayImage>]>) -> Vec<PairResidual> {
+        pair_matches(rig, &[images], masks).iter().map(PairResidual::from).collect()
+    }
+
     /// A textured wall at y = 3 m, seen by three cameras.
     fn wall() -> (Rig, Vec<GrayImage>) {
         let camera_from_world = Rotation3::from_scaled_axis(Vector3::x() * std::f64::consts::FRAC_PI_2);
@@ -218,14 +250,14 @@ mod tests {
     #[test]
     fn right_cameras_fit_and_a_turned_one_shows_its_error() {
         let (mut rig, images) = wall();
-        for pair in epipolar_residuals(&rig, &[&images], None) {
+        for pair in residuals(&rig, &images, None) {
             assert!(pair.matches > 30 && pair.median_px.unwrap() < 0.15, "{pair:?}");
         }
         // Pitch moves the picture of camera 1 by 280 px tan(1 degree) = 4.9 px across its epipolar curves with camera 0.
         let pitch = Rotation3::from_scaled_axis(Vector3::x() * 1f64.to_radians());
         rig.cameras[1].camera_from_world = pitch * rig.cameras[1].camera_from_world;
         rig.cameras[1].translation = pitch * rig.cameras[1].translation;
-        let found = epipolar_residuals(&rig, &[&images], None);
+        let found = residuals(&rig, &images, None);
         assert!((found[0].median_px.unwrap() - 4.9).abs() < 0.4, "{found:?}");
         assert!(found[1].median_px.unwrap() < 0.15 && found[2].median_px.unwrap() > 1.5, "{found:?}");
     }
@@ -235,11 +267,11 @@ mod tests {
         let (rig, images) = wall();
         let half: Vec<_> =
             images.iter().map(|i| GrayImage::from_fn(i.width(), i.height(), |x, _| image::Luma([if x < 160 { 255 } else { 0 }]))).collect();
-        let all = epipolar_residuals(&rig, &[&images], None)[0].matches;
-        let some = epipolar_residuals(&rig, &[&images], Some(&[half]))[0].matches;
+        let all = residuals(&rig, &images, None)[0].matches;
+        let some = residuals(&rig, &images, Some(&[half]))[0].matches;
         assert!(some > 10 && some < all * 2 / 3, "{some} of {all}");
         let plain = vec![GrayImage::from_pixel(320, 240, image::Luma([90])); 3];
-        assert!(epipolar_residuals(&rig, &[&plain], None).iter().all(|p| p.matches == 0 && p.median_px.is_none()));
+        assert!(residuals(&rig, &plain, None).iter().all(|p| p.matches == 0 && p.median_px.is_none()));
     }
 
     #[test]

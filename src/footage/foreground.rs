@@ -352,7 +352,7 @@ mod tests {
         let mut mixture = video::create_background_subtractor_mog2(60, 16.0, false).unwrap();
         for frame in &frames {
             let picture = Mat::new_rows_cols_with_data(60, 160, frame.as_raw()).unwrap();
-            <_ as BackgroundSubtractorMOG2Trait>::apply(&mut mixture, &picture, &mut Mat::default(), -1.0).unwrap();
+            BackgroundSubtractorMOG2Trait::apply(&mut mixture, &picture, &mut Mat::default(), -1.0).unwrap();
         }
         let mut background = Mat::default();
         BackgroundSubtractorTraitConst::get_background_image(&mixture, &mut background).unwrap();

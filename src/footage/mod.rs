@@ -1,9 +1,16 @@
 //! Simultaneous images with times, synchronization check, foreground.
 
+pub mod board;
 pub mod check;
+pub mod corner;
 pub mod epipolar;
 pub mod foreground;
+pub mod misfit;
+pub mod pattern;
+pub mod person;
+pub mod reduce;
 pub mod regions;
+pub mod synchrony;
 
 pub use foreground::{ForegroundOptions, foreground, spread, stage_from_frames};
 

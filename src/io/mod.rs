@@ -4,6 +4,8 @@ pub mod asf_amc;
 pub mod atomic;
 pub mod bvh;
 pub mod calib_toml;
+pub mod calib_views;
+pub mod calibration_json;
 pub mod fit_json;
 pub mod images;
 pub mod joints_csv;

@@ -8,6 +8,7 @@ use super::calib_toml::{self, CalibError};
 use super::images::{self, ImageError};
 use super::video::{self, Video, VideoError, VideoFacts};
 use crate::footage::{self, FrameSet};
+use crate::math::order::quantile;
 use crate::rig::{Camera, Rig};
 use image::GrayImage;
 use rayon::prelude::*;
@@ -20,6 +21,8 @@ const DEFAULT_FPS: f64 = 30.0;
 const STAGE_FRAMES: usize = 25;
 /// Headers of whole videos promise up to this many frames more than they hold.
 const HEADER_EXCESS_FRAMES: usize = 2;
+/// Time stamps may differ by this share of a frame; a dropped frame is a whole one.
+const LARGEST_JITTER: f64 = 0.5;
 
 /// What can be wrong with a session; every message names the folder, file, camera or frame.
 #[derive(Debug, thiserror::Error)]
@@ -64,6 +67,12 @@ pub enum SessionError {
     Fps { fps: f64 },
     #[error("{}: runs at {fps} frames/s, {} at {other_fps}; synchronized cameras have one rate", path.display(), other.display())]
     UnequalFps { path: PathBuf, fps: f64, other: PathBuf, other_fps: f64 },
+    #[error(
+        "{}: frame {frame} comes {apart_ms:.0} ms {side} after the first one than in {}; a camera dropped frames or runs at another rate, film again with one trigger for all",
+        path.display(),
+        other.display()
+    )]
+    UnequalTimes { path: PathBuf, other: PathBuf, frame: usize, apart_ms: f64, side: &'static str },
     #[error("frame {index} of a video cannot be read alone; read videos from the first frame on")]
     VideoAccess { index: usize },
     #[error("there is no frame {index}, the session has {count}")]
@@ -220,7 +229,7 @@ impl Frames<'_> {
 }
 
 /// Visible names in a folder, naturally sorted.
-fn list(folder: &Path) -> Result<Vec<PathBuf>, SessionError> {
+pub(super) fn list(folder: &Path) -> Result<Vec<PathBuf>, SessionError> {
     let failed = |error| SessionError::Read { path: folder.into(), error };
     let paths =
         std::fs::read_dir(folder).map_err(failed)?.map(|entry| entry.map(|e| e.path())).collect::<Result<Vec<_>, _>>().map_err(failed)?;
@@ -229,11 +238,11 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>, SessionError> {
     Ok(named.into_iter().map(|(_, path)| path).collect())
 }
 
-fn file_name(path: &Path) -> String {
+pub(super) fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-fn stem(path: &Path) -> String {
+pub(super) fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
@@ -287,15 +296,20 @@ fn open_images(
 }
 
 /// The pictures of a folder by ascending frame number, at least one.
-fn numbered_images(folder: &Path) -> Result<Vec<(usize, PathBuf)>, SessionError> {
+pub(super) fn numbered_images(folder: &Path) -> Result<Vec<(usize, PathBuf)>, SessionError> {
+    numbered(folder, list(folder)?)
+}
+
+/// The pictures among `files`, of which `place` holds or names all.
+pub(super) fn numbered(place: &Path, files: Vec<PathBuf>) -> Result<Vec<(usize, PathBuf)>, SessionError> {
     let is_picture = |path: &PathBuf| images::is_image_name(path) && !path.is_dir();
     let number = |path: PathBuf| Ok((frame_number(&path).ok_or_else(|| SessionError::NoNumber { path: path.clone() })?, path));
-    let mut files = list(folder)?.into_iter().filter(is_picture).map(number).collect::<Result<Vec<_>, SessionError>>()?;
+    let mut files = files.into_iter().filter(is_picture).map(number).collect::<Result<Vec<_>, SessionError>>()?;
     files.sort_by_key(|(number, _)| *number);
     if let Some(pair) = files.windows(2).find(|pair| pair[0].0 == pair[1].0) {
         return Err(SessionError::SameNumber { number: pair[0].0, first: pair[0].1.clone(), second: pair[1].1.clone() });
     }
-    if files.is_empty() { Err(SessionError::Empty { path: folder.into() }) } else { Ok(files) }
+    if files.is_empty() { Err(SessionError::Empty { path: place.into() }) } else { Ok(files) }
 }
 
 /// The last run of digits in the name, without the extension.
@@ -357,7 +371,34 @@ fn open_videos(folder: &Path, rig: &Rig, sources: &[PathBuf], notices: &mut Vec<
     }
     let short = facts.iter().zip(sources).filter(|(f, _)| f.decoded < f.promised);
     notices.extend(short.map(|(f, path)| format!("{}: its header promises {} frames, it holds {}", path.display(), f.promised, f.decoded)));
-    Ok((most, common_fps(&facts, sources)?))
+    let fps = common_fps(&facts, sources)?;
+    notices.extend(common_times(&facts, sources)?);
+    Ok((most, fps))
+}
+
+/// Frames of the same number must come at the same time after the first; a notice where that time is not uniform.
+fn common_times(facts: &[VideoFacts], sources: &[PathBuf]) -> Result<Option<String>, SessionError> {
+    let mut stamped = facts.iter().zip(sources).filter(|(f, _)| f.times_s.len() > 1).map(|(f, path)| (&f.times_s, path));
+    let Some((times, other)) = stamped.next() else { return Ok(None) };
+    let Some(usual) = quantile(times.windows(2).map(|pair| pair[1] - pair[0]).collect(), 0.5) else { return Ok(None) };
+    for (own, path) in stamped {
+        let apart = own.iter().zip(times).map(|(a, b)| (a - own[0]) - (b - times[0])).enumerate();
+        if let Some((frame, apart_s)) = apart.into_iter().find(|(_, apart)| apart.abs() > LARGEST_JITTER * usual) {
+            let side = if apart_s > 0.0 { "later" } else { "earlier" };
+            let (path, other, apart_ms) = (path.clone(), other.clone(), 1e3 * apart_s.abs());
+            return Err(SessionError::UnequalTimes { path, other, frame, apart_ms, side });
+        }
+    }
+    let uneven = |pair: &[f64]| ((pair[1] - pair[0]) / usual - 1.0).abs() > LARGEST_JITTER;
+    let count = times.windows(2).filter(|pair| uneven(pair)).count();
+    let first = times.windows(2).position(uneven);
+    Ok(first.map(|first| {
+        format!(
+            "the frame rate varies: {count} frames, the first is {}, come not {:.1} ms after the one before; frames are taken as evenly spaced, so speeds will be wrong there",
+            first + 1,
+            1e3 * usual
+        )
+    }))
 }
 
 /// The videos' frame rate; `None` where no file says it.
@@ -588,7 +629,8 @@ mod tests {
     }
 
     fn write_video(path: &Path, camera: usize, frames: usize, fps: f64) {
-        let fourcc = VideoWriter::fourcc('M', 'J', 'P', 'G').unwrap();
+        let [a, b, c, d] = if path.extension().unwrap() == "mp4" { ['m', 'p', '4', 'v'] } else { ['M', 'J', 'P', 'G'] };
+        let fourcc = VideoWriter::fourcc(a, b, c, d).unwrap();
         let size = Size::new(SIZE[0] as i32, SIZE[1] as i32);
         let mut writer = VideoWriter::new(path, fourcc, fps, size, false).unwrap();
         assert!(writer.is_opened().unwrap());
@@ -598,6 +640,43 @@ mod tests {
             writer.write(&Mat::new_rows_cols_with_data(SIZE[1] as i32, SIZE[0] as i32, noisy.as_raw()).unwrap()).unwrap();
         }
         writer.release().unwrap();
+    }
+
+    /// Makes the frame after `late` in an MP4 of `frames` come one frame later, and the next in time again: the table of
+    /// durations (stts) gets three more entries.
+    fn delay(path: &Path, frames: u32, late: u32) {
+        let mut bytes = fs::read(path).unwrap();
+        let find = |bytes: &[u8], name: &[u8]| bytes.windows(4).position(|w| w == name).unwrap();
+        let number = |bytes: &[u8], at: usize| u32::from_be_bytes(bytes[at..at + 4].try_into().unwrap());
+        for name in [b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"] {
+            let at = find(&bytes, name) - 4;
+            let longer = number(&bytes, at) + 24;
+            bytes[at..at + 4].copy_from_slice(&longer.to_be_bytes());
+        }
+        let entries = find(&bytes, b"stts") + 8;
+        assert_eq!([number(&bytes, entries), number(&bytes, entries + 4)], [1, frames]);
+        let step = number(&bytes, entries + 8);
+        let table = [4, late, step, 1, 2 * step - 1, 1, 1, frames - late - 2, step];
+        bytes.splice(entries..entries + 12, table.iter().flat_map(|n: &u32| n.to_be_bytes()));
+        fs::write(path, bytes).unwrap();
+    }
+
+    #[test]
+    fn time_stamps_tell_dropped_frames() {
+        let study = tempfile::tempdir().unwrap();
+        let walk = study.path().join("walk");
+        fs::create_dir(&walk).unwrap();
+        calib_toml::write_rig(&walk.join("Calib.toml"), &rig(2)).unwrap();
+        let paths = [walk.join("cam_00.mp4"), walk.join("cam_01.mp4")];
+        paths.iter().enumerate().for_each(|(k, path)| write_video(path, k, 20, 25.0));
+        let (session, notices) = open(&study).unwrap();
+        assert_eq!((session.frame_count, notices), (20, vec![]));
+        delay(&paths[1], 20, 7);
+        let refused = refusal(&study);
+        assert!(refused.contains("cam_01.mp4: frame 8 comes 40 ms later after the first one than in "), "{refused}");
+        delay(&paths[0], 20, 7);
+        let (_, notices) = open(&study).unwrap();
+        assert!(notices[0].contains("2 frames, the first is 8, come not 40.0 ms"), "{notices:?}");
     }
 
     #[test]

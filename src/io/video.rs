@@ -25,7 +25,7 @@ pub fn is_video_name(path: &Path) -> bool {
 }
 
 /// What the header of a video promises, and what it holds.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct VideoFacts {
     pub size_px: [u32; 2],
     /// `None` where the file does not say.
@@ -34,6 +34,8 @@ pub struct VideoFacts {
     pub promised: usize,
     /// Number of frames that decode.
     pub decoded: usize,
+    /// Their time stamps, seconds; empty where the file has none that grow.
+    pub times_s: Vec<f64>,
 }
 
 /// Opens a video, decodes it to its end and counts.
@@ -43,11 +45,21 @@ pub fn count_frames(path: &Path) -> Result<VideoFacts, VideoError> {
     let size_px = [property(videoio::CAP_PROP_FRAME_WIDTH) as u32, property(videoio::CAP_PROP_FRAME_HEIGHT) as u32];
     let fps = Some(property(videoio::CAP_PROP_FPS)).filter(|f| (1.0..=10_000.0).contains(f));
     let promised = property(videoio::CAP_PROP_FRAME_COUNT).max(0.0) as usize;
-    let mut decoded = 0;
+    let mut times_s = Vec::new();
     while video.capture.grab().unwrap_or(false) {
-        decoded += 1;
+        times_s.push(video.capture.get(videoio::CAP_PROP_POS_MSEC).unwrap_or(0.0) / 1e3);
     }
-    Ok(VideoFacts { size_px, fps, promised, decoded })
+    let decoded = times_s.len();
+    if times_s.windows(2).any(|pair| !pair[0].is_finite() || pair[1] <= pair[0]) {
+        times_s.clear();
+    }
+    Ok(VideoFacts { size_px, fps, promised, decoded, times_s })
+}
+
+/// Number of frames by the header; `None` where it does not say or cannot be read.
+pub fn promised_frames(path: &Path) -> Option<usize> {
+    let count = Video::open(path).ok()?.capture.get(videoio::CAP_PROP_FRAME_COUNT).ok()?;
+    (count > 0.0).then_some(count as usize)
 }
 
 /// A video being read.

@@ -5,10 +5,13 @@
 
 use std::path::{Path, PathBuf};
 
-use image::{ImageFormat, RgbImage};
+use image::{DynamicImage, ImageFormat, RgbImage};
 
+use crate::footage::board::BoardError;
 use crate::io::write_atomic;
 
+pub mod board;
+pub mod calibration;
 pub mod canvas;
 pub mod clouds;
 pub mod curves;
@@ -17,6 +20,7 @@ pub mod maps;
 pub mod overlay;
 pub mod rig;
 
+pub use calibration::calibration;
 pub use clouds::cloud_and_body;
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
@@ -28,6 +32,8 @@ pub use rig::rig_views;
 pub enum ReportError {
     #[error("drawing failed: {0}")]
     Draw(#[from] opencv::Error),
+    #[error(transparent)]
+    Board(#[from] BoardError),
     #[error("cannot encode {path}: {error}")]
     Encode { path: PathBuf, error: image::ImageError },
     #[error("cannot write {path}: {error}")]
@@ -36,7 +42,13 @@ pub enum ReportError {
 
 /// Writes a picture as PNG.
 pub fn save(path: &Path, picture: &RgbImage) -> Result<(), ReportError> {
+    let png = png_bytes(path, &DynamicImage::from(picture.clone()))?;
+    write_atomic(path, &png).map_err(|error| ReportError::Write { path: path.into(), error })
+}
+
+/// The PNG file that `path` is to be.
+fn png_bytes(path: &Path, picture: &DynamicImage) -> Result<Vec<u8>, ReportError> {
     let mut png = std::io::Cursor::new(Vec::new());
     picture.write_to(&mut png, ImageFormat::Png).map_err(|error| ReportError::Encode { path: path.into(), error })?;
-    write_atomic(path, png.get_ref()).map_err(|error| ReportError::Write { path: path.into(), error })
+    Ok(png.into_inner())
 }

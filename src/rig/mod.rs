@@ -1,5 +1,6 @@
 //! Cameras and rigs of N cameras, three-view rectification.
 
+pub mod calibrate;
 pub mod camera;
 pub mod lens;
 pub mod rectify;

@@ -300,10 +300,11 @@ fn fastest<const N: usize>(rounds: usize, mut contestants: [&mut dyn FnMut() -> 
     Ok(best)
 }
 
-fn matched(views: &[StereoView], disparities: usize, radius: usize) {
+fn matched(views: &[StereoView], disparities: usize, radius: usize) -> Result<()> {
     let (width, height) = views[0].plane.dimensions();
     let all = Region { x: [0, width as usize], y: [0, height as usize] };
     std::hint::black_box(match_view(views, 0, all, [0, disparities - 1], &StereoOptions { radius, ..StereoOptions::default() }));
+    Ok(())
 }
 
 fn times(rounds: usize) -> Result<()> {
@@ -319,10 +320,10 @@ fn times(rounds: usize) -> Result<()> {
     let best = fastest(
         rounds,
         [
-            &mut || Ok(one.install(|| matched(&l_shape, 64, radius))),
-            &mut || Ok(two.install(|| matched(&l_shape, 64, radius))),
-            &mut || Ok(one.install(|| matched(&row, 64, radius))),
-            &mut || Ok(one.install(|| matched(&l_shape[..2], 64, radius))),
+            &mut || one.install(|| matched(&l_shape, 64, radius)),
+            &mut || two.install(|| matched(&l_shape, 64, radius)),
+            &mut || one.install(|| matched(&row, 64, radius)),
+            &mut || one.install(|| matched(&l_shape[..2], 64, radius)),
             &mut || {
                 bm.compute(&left, &right)?;
                 bm.compute(&upright, &upper).map(|_| ())
@@ -341,7 +342,7 @@ fn times(rounds: usize) -> Result<()> {
     println!("\nours, three views, one thread: ns per pixel and disparity");
     let per = |width: u32, height: u32, disparities: usize, radius: usize| -> Result<f64> {
         let views = Triple::new(width, height).l_shape();
-        let [ms] = fastest(rounds.div_ceil(3), [&mut || Ok(one.install(|| matched(&views, disparities, radius)))])?;
+        let [ms] = fastest(rounds.div_ceil(3), [&mut || one.install(|| matched(&views, disparities, radius))])?;
         Ok(1e6 * ms / f64::from(width * height) / disparities as f64)
     };
     for (width, height) in [(320, 240), (640, 480), (1280, 960)] {
