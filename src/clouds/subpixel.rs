@@ -61,9 +61,9 @@ const LEAST_VARIANCE: f32 = 1.0;
 /// Reach of j in (3).
 const JUMP_REACH_PX: usize = 5;
 /// a, b and c of (3).
-const NOISE_SHARE: f32 = 0.36;
-const MISFIT_SHARE: f32 = 0.036;
-const JUMP_SHARE: f32 = 0.0097;
+const NOISE_SHARE: f32 = 0.40;
+const MISFIT_SHARE: f32 = 0.040;
+const JUMP_SHARE: f32 = 0.0107;
 /// Disparities with a larger σ are dropped, and those for which no step was believed: beside edges, and without texture.
 const LARGEST_SIGMA_PX: f32 = 0.35;
 
@@ -274,9 +274,9 @@ mod tests {
 
     /// Error before and after refinement, sigma and true disparity of the refined pixels.
     fn matched(views: &[(Plane, Vector2<f64>); 3], [a, b, c]: [f64; 3]) -> Vec<[f64; 4]> {
-        let prepared: Vec<StereoView> = views.iter().map(|v| StereoView { plane: v.0.clone(), step: v.1 }).collect();
+        let views_of: Vec<StereoView> = views.iter().map(|(plane, step)| StereoView { plane: plane.clone(), step: *step }).collect();
         let all = Region { x: [0, SIZE[0] as usize], y: [0, SIZE[1] as usize] };
-        let found = match_view(&prepared, 0, all, [5, 45], &StereoOptions::default());
+        let found = match_view(&views_of, 0, all, [5, 45], &StereoOptions::default());
         let refined = refine(&views[0].0, &[(&views[1].0, views[1].1), (&views[2].0, views[2].1)], &found.disparity, &found.confirmed);
         let inner = found.disparity.enumerate_pixels().filter(|(x, y, _)| (60..230).contains(x) && (10..120).contains(y));
         let inner = inner.filter(|(x, y, _)| !refined.disparity.get_pixel(*x, *y).0[0].is_nan());

@@ -355,7 +355,7 @@ mod tests {
             BackgroundSubtractorMOG2Trait::apply(&mut mixture, &picture, &mut Mat::default(), -1.0).unwrap();
         }
         let mut background = Mat::default();
-        BackgroundSubtractorMOG2TraitConst::get_background_image(&mixture, &mut background).unwrap();
+        BackgroundSubtractorTraitConst::get_background_image(&mixture, &mut background).unwrap();
         let theirs = error(background.data_bytes().unwrap());
         let middle = error(&frames[30]);
         println!("pixels off: {ours:.4}, MOG2 {theirs:.4}, one frame {middle:.4}");
