@@ -298,8 +298,11 @@ fn dark_first(polished: Vec<(usize, Point2<f64>, f64)>, columns: usize, rows: us
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::io::images::read_grey;
     use std::path::{Path, PathBuf};
+
+    fn read_grey(path: &std::path::Path) -> image::ImageResult<GrayImage> {
+        Ok(image::open(path)?.into_luma8())
+    }
 
     fn data(name: &str) -> Option<PathBuf> {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/calibration").join(name);
