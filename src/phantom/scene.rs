@@ -175,7 +175,7 @@ fn pixels(figure: &Figure, camera: &Camera) -> Vec<(u32, u32)> {
 }
 
 /// Columns and rows that hold the picture of a sphere; `None` behind the camera.
-fn pixel_box(camera: &Camera, centre: &Vector3<f64>, radius: f64) -> Option<[std::ops::Range<u32>; 2]> {
+pub(super) fn pixel_box(camera: &Camera, centre: &Vector3<f64>, radius: f64) -> Option<[std::ops::Range<u32>; 2]> {
     let [width, height] = camera.size_px;
     let c = camera.camera_point(centre);
     if c.z < -radius {
@@ -241,7 +241,7 @@ fn expose(scene: &Scene, view: &View, grey: &[f32], frame: u64) -> GrayImage {
 }
 
 /// Two independent standard normal numbers (Box and Muller).
-fn gaussian_pair(rng: &mut ChaCha8Rng) -> [f64; 2] {
+pub(super) fn gaussian_pair(rng: &mut ChaCha8Rng) -> [f64; 2] {
     let unit = |n: u32| (n as f64 + 0.5) / 4_294_967_296.0;
     let radius = (-2.0 * unit(rng.next_u32()).ln()).sqrt();
     let (sin, cos) = (std::f64::consts::TAU * unit(rng.next_u32())).sin_cos();

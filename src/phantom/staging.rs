@@ -83,7 +83,7 @@ pub fn poses_in_world(clip: &Clip, shape: &Shape, up: Up, start_m: [f64; 2], hea
 }
 
 /// Height of the lowest primitive's skin, metres.
-fn lowest_m(surface: &Surface, placement: &Placement, up: Up) -> f64 {
+pub fn lowest_m(surface: &Surface, placement: &Placement, up: Up) -> f64 {
     let skin = crate::body::surface::SKIN.sqrt();
     let lowest = surface.primitives.iter().map(|p| {
         let world_from_node = placement.world_from_node[p.node as usize];

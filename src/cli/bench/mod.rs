@@ -2,6 +2,8 @@
 
 mod people;
 mod stereo;
+mod sweeps;
+mod takes;
 
 use anyhow::Result;
 
@@ -11,11 +13,14 @@ pub enum BenchCommand {
     Clouds(people::PeopleArgs),
     /// Disparities of Middlebury's pairs and the time they take, beside OpenCV's StereoBM and StereoSGBM
     Stereo(stereo::StereoArgs),
+    /// The fit on phantoms over noise, rigs, frame rates, lost frames, clutter and headings, and on random walks
+    Sweeps(sweeps::SweepsArgs),
 }
 
 pub fn run(command: &BenchCommand) -> Result<()> {
     match command {
         BenchCommand::Clouds(args) => people::run(args),
         BenchCommand::Stereo(args) => stereo::run(args),
+        BenchCommand::Sweeps(args) => sweeps::run(args),
     }
 }
