@@ -56,13 +56,15 @@ pub struct FitOptions {
     /// Whether the person may leave the model: joints' posture and turns from frame to frame. They are kept only if they
     /// bring the body nearer to points that the fit did not see.
     pub deviations: bool,
+    /// Whether limbs may be longer or shorter than the template's.
+    pub lengths: bool,
 }
 
 impl Default for FitOptions {
     /// Twenty components reach 2.5 degrees against the true joints where ten reach 4 (fit on CMU walks); 500 points and
     /// 100 rays a frame cost about the same as the silhouettes' search and more change nothing.
     fn default() -> Self {
-        FitOptions { components: 20, points: 500, rays: 100, deviations: true }
+        FitOptions { components: 20, points: 500, rays: 100, deviations: true, lengths: true }
     }
 }
 
@@ -207,7 +209,8 @@ pub fn fit(
 
     let dense = chosen(options.points, options.rays);
     step(0.4)?;
-    let last = Stage { free: SHAPED, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
+    let shaped = if options.lengths { SHAPED } else { STYLED };
+    let last = Stage { free: shaped, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
     step(0.5)?;
     state = run.stage(state, &dense, &ten, &Stage { refreshes: 6, ..last });
@@ -216,15 +219,16 @@ pub fn fit(
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &dense, &curve, &last);
     step(0.7)?;
-    let mut free = SHAPED;
+    let mut free = shaped;
+    let posed = Free { lengths: options.lengths, ..POSED };
     if options.deviations {
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
-        let own = run.stage(own, &dense, &curve, &Stage { free: POSED, ..last });
+        let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
         step(0.85)?;
         let left_out: Vec<Frame> = observations.iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &SETTINGS, &known, state)).cost;
         if cost(&own) < cost(&state) {
-            (state, free) = (own, POSED);
+            (state, free) = (own, posed);
         }
     }
     step(0.95)?;

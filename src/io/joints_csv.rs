@@ -1,5 +1,6 @@
 //! `joints.csv`: joint centres over time, `frame,time_s,joint,x_m,y_m,z_m`, in the rig's world.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -16,7 +17,16 @@ pub enum JointsCsvError {
     Counts { path: PathBuf, numbers: usize, positions: usize },
     #[error("{path}: frame {frame}: position of {joint} is not finite")]
     NotFinite { path: PathBuf, frame: usize, joint: &'static str },
+    #[error("{path}: cannot be read: {error}")]
+    Read { path: PathBuf, error: std::io::Error },
+    #[error(
+        "{path}: line {line}: expected frame,time_s,joint,x_m,y_m,z_m with finite numbers; write the file again with `track` or `render`"
+    )]
+    Line { path: PathBuf, line: usize },
 }
+
+/// Joint centres by frame number, metres, by `joint as usize`; NaN for nodes that a file does not have.
+pub type Joints = BTreeMap<usize, [Vector3<f64>; NODES]>;
 
 /// Joints in the order of the file with their names there.
 pub fn columns() -> impl Iterator<Item = (Joint, &'static str)> {
@@ -62,6 +72,28 @@ pub fn write(path: &Path, frames: &[(usize, f64)], positions: &[[Vector3<f64>; N
     write_atomic(path, text.as_bytes()).map_err(|error| JointsCsvError::Io { path: path.into(), error })
 }
 
+/// Reads what [`write`] writes; names that are no joint of ours, as other programs write them beside, are passed over.
+pub fn read(path: &Path) -> Result<Joints, JointsCsvError> {
+    let text = std::fs::read_to_string(path).map_err(|error| JointsCsvError::Read { path: path.into(), error })?;
+    let known: BTreeMap<&str, Joint> = columns().map(|(joint, name)| (name, joint)).collect();
+    let mut joints = Joints::new();
+    for (index, line) in text.lines().enumerate().skip(1).filter(|(_, line)| !line.trim().is_empty()) {
+        let wrong = || JointsCsvError::Line { path: path.into(), line: index + 1 };
+        let (frame, name, x) = row(line).ok_or_else(wrong)?;
+        let placed = joints.entry(frame).or_insert([Vector3::repeat(f64::NAN); NODES]);
+        if let Some(joint) = known.get(name) {
+            placed[*joint as usize] = x;
+        }
+    }
+    Ok(joints)
+}
+
+fn row(line: &str) -> Option<(usize, &str, Vector3<f64>)> {
+    let cells: [&str; 6] = line.split(',').map(str::trim).collect::<Vec<_>>().try_into().ok()?;
+    let number = |k: usize| cells[k].parse::<f64>().ok().filter(|v| v.is_finite());
+    Some((cells[0].parse().ok()?, cells[2], Vector3::new(number(3)?, number(4)?, number(5)?)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -82,6 +114,23 @@ mod tests {
         assert!(rows[1 + NODES].starts_with("6,0.066667,pelvis,"));
         let names: std::collections::BTreeSet<_> = columns().map(|(_, name)| name).collect();
         assert_eq!(names.len(), NODES);
+        let back = read(&path).unwrap();
+        assert_eq!(back.keys().copied().collect::<Vec<_>>(), [4, 6]);
+        assert!(back[&6].iter().zip(&placed).all(|(a, b)| (a - b).amax() < 6e-6));
+    }
+
+    #[test]
+    fn strange_joints_are_passed_over_and_broken_lines_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("joints.csv");
+        std::fs::write(&path, "frame,time_s,joint,x_m,y_m,z_m\n2,0.1,tail,1,2,3\n2,0.1,l_knee,1,2,3\n").unwrap();
+        let joints = read(&path).unwrap();
+        assert_eq!(joints[&2][Joint::LKnee as usize], Vector3::new(1.0, 2.0, 3.0));
+        assert!(joints[&2][Joint::RKnee as usize].x.is_nan());
+        for broken in ["2,0.1,l_knee,1,2", "2,0.1,l_knee,1,2,nan", "two,0.1,l_knee,1,2,3"] {
+            std::fs::write(&path, format!("frame,time_s,joint,x_m,y_m,z_m\n{broken}\n")).unwrap();
+            assert!(read(&path).unwrap_err().to_string().contains("line 2"), "{broken}");
+        }
     }
 
     #[test]

@@ -103,6 +103,23 @@ pub fn joint_errors(found: &[Positions], truth: &[Positions]) -> JointErrors {
     }
 }
 
+/// Mean error of the joint centres, metres, when the mean offset of each joint in the person's frame (true hip line, `up`)
+/// is taken out: a skeleton of another kind has constant offsets, an error in tracking has not.
+pub fn varying_m(found: &[Positions], truth: &[Positions], up: &Vector3<f64>) -> f64 {
+    let of_joint = |joint: Joint| {
+        let in_person = |(f, t): (&Positions, &Positions)| {
+            let hips = t[LHip as usize] - t[RHip as usize];
+            let side = (hips - up * hips.dot(up)).try_normalize(1e-9).unwrap_or_default();
+            let error = f[joint as usize] - t[joint as usize];
+            Vector3::new(error.dot(&side), error.dot(&up.cross(&side)), error.dot(up))
+        };
+        let errors: Vec<Vector3<f64>> = found.iter().zip(truth).map(in_person).collect();
+        let mean = errors.iter().sum::<Vector3<f64>>() / errors.len().max(1) as f64;
+        errors.iter().map(|e| (e - mean).norm()).sum::<f64>() / errors.len().max(1) as f64
+    };
+    SCORED.map(of_joint).iter().sum::<f64>() / SCORED.len() as f64
+}
+
 /// Angle at the second of three joints, radians.
 pub fn included_angle(positions: &Positions, joints: &[Joint; 3]) -> f64 {
     let [a, b, c] = joints.map(|j| positions[j as usize]);
@@ -155,6 +172,24 @@ mod tests {
             // Samples are 4 mm apart, so the nearest of them is at most sqrt(d^2 + 3^2 mm) away where sampled at all.
             assert!((found - brute).abs() < 0.0035, "{x:?}: {found} {brute}");
         }
+    }
+
+    #[test]
+    fn offsets_that_turn_with_the_person_do_not_vary() {
+        let offsets = Shape::template(1.7).offsets();
+        let facing = |angle: f64| Pose { world_from_root: exp(&(Vector3::y() * angle)), ..Pose::rest(Vector3::new(angle, 0.9, 0.0)) };
+        let truth: Vec<Positions> = (0..8).map(|k| place(&offsets, &facing(0.3 * f64::from(k))).positions).collect();
+        let shifted = |by: &dyn Fn(usize) -> Vector3<f64>| -> Vec<Positions> {
+            truth.iter().enumerate().map(|(k, t)| t.map(|x| x + exp(&(Vector3::y() * 0.3 * k as f64)) * by(k))).collect()
+        };
+        let up = Vector3::y();
+        assert!(varying_m(&shifted(&|_| Vector3::new(0.02, -0.01, 0.03)), &truth, &up) < 1e-12);
+        // Back and forth by 2 cm about the mean.
+        let swinging = shifted(&|k| Vector3::new(0.01, 0.0, if k % 2 == 0 { 0.02 } else { -0.02 }));
+        assert!((varying_m(&swinging, &truth, &up) - 0.02).abs() < 1e-12);
+        // Offsets that stay in the world turn against the person.
+        let dragged: Vec<Positions> = truth.iter().map(|t| t.map(|x| x + Vector3::new(0.02, 0.0, 0.0))).collect();
+        assert!(varying_m(&dragged, &truth, &up) > 0.005);
     }
 
     #[test]

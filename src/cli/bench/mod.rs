@@ -1,5 +1,7 @@
 //! `muybridge bench`: tables of accuracy and time beside OpenCV's, in the same process.
 
+mod coverage;
+mod fit;
 mod people;
 mod stereo;
 mod sweeps;
@@ -13,14 +15,20 @@ pub enum BenchCommand {
     Clouds(people::PeopleArgs),
     /// Disparities of Middlebury's pairs and the time they take, beside OpenCV's StereoBM and StereoSGBM
     Stereo(stereo::StereoArgs),
+    /// What each ingredient of the fit is worth on sessions with known joints
+    Fit(fit::FitArgs),
     /// The fit on phantoms over noise, rigs, frame rates, lost frames, clutter and headings, and on random walks
     Sweeps(sweeps::SweepsArgs),
+    /// How often the fit's 95 % intervals hold the truth
+    Coverage(coverage::CoverageArgs),
 }
 
 pub fn run(command: &BenchCommand) -> Result<()> {
     match command {
         BenchCommand::Clouds(args) => people::run(args),
         BenchCommand::Stereo(args) => stereo::run(args),
+        BenchCommand::Fit(args) => fit::run(args),
         BenchCommand::Sweeps(args) => sweeps::run(args),
+        BenchCommand::Coverage(args) => coverage::run(args),
     }
 }

@@ -107,7 +107,7 @@ pub struct Take {
     pub truth: Vec<Positions>,
     /// Unwrapped, one per frame.
     pub phases: Vec<f64>,
-    pub shape: Shape,
+    pub floor_m: f64,
 }
 
 impl Walk {
@@ -134,8 +134,8 @@ impl Walk {
             observations: observe(&rig, &shape, &frames, &seen, &self.sight)?,
             truth: positions(&shape, &seen),
             phases: frames.iter().map(|(_, t)| (from_s + t) / cycle.duration_s).collect(),
+            floor_m: 0.0,
             rig,
-            shape,
         })
     }
 }
@@ -178,13 +178,13 @@ impl Score {
     }
 }
 
-pub fn fitted(take: &Take, model: &Model, options: &FitOptions) -> Result<Fit> {
-    Ok(fit::fit(&take.observations, &take.rig, model, Some(0.0), options, &|_| !interrupt::came())?)
+pub fn fitted(take: &Take, model: &Model, options: &FitOptions) -> Result<Fit, FitError> {
+    fit::fit(&take.observations, &take.rig, model, Some(take.floor_m), options, &|_| !interrupt::came())
 }
 
 /// Fit and score; `None` where the fit cannot begin.
 pub fn score(take: &Take, model: &Model, options: &FitOptions) -> Result<Option<Score>> {
-    let fit = match fit::fit(&take.observations, &take.rig, model, Some(0.0), options, &|_| !interrupt::came()) {
+    let fit = match fitted(take, model, options) {
         Ok(fit) => fit,
         Err(error @ FitError::Interrupted) => return Err(error.into()),
         Err(_) => return Ok(None),

@@ -1,0 +1,173 @@
+//! The fit on measurements made without pictures, whose truth is a state of the model itself.
+
+use std::sync::Arc;
+
+use muybridge::body::{Joint, NODES, Pose, PosedSurface, Shape, Surface, place};
+use muybridge::clouds::{Cloud, CloudPoint};
+use muybridge::fit::curve::Curve;
+use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
+use muybridge::fit::state::{Carrier, State, Turns};
+use muybridge::fit::{FitOptions, Observation, fit};
+use muybridge::math::arrow::{LmOptions, minimise};
+use muybridge::motion_model::{Activity, Model, synthetic};
+use muybridge::phantom::{Figure, SightOptions, joint_errors, sighting, staging};
+use muybridge::rig::rectify::groups;
+use muybridge::rig::{Camera, Lens, Rig, Up};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
+
+/// Distance of the walkers from the cameras, metres.
+const DISTANCE_M: f64 = 3.6;
+
+/// Half of the embedded database: quick to build and still with a style for every person.
+fn model() -> Model {
+    let cycles: Vec<_> = (1..=synthetic::subjects(Activity::Walking))
+        .flat_map(|seed| [0.9, 1.2, 1.5, 1.8].map(|v| synthetic::subject(Activity::Walking, seed).cycle(v, 0)))
+        .collect();
+    Model::build(Activity::Walking, true, &cycles).unwrap()
+}
+
+/// Three cameras in an L of 0.3 m, 1 m above the floor, looking along y.
+fn rig() -> Rig {
+    let camera_from_world = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0));
+    let camera = |(x, z): (f64, f64)| Camera {
+        name: format!("{x} {z}"),
+        size_px: [640, 480],
+        matrix: Matrix3::new(550.0, 0.0, 319.5, 0.0, 550.0, 239.5, 0.0, 0.0, 1.0),
+        lens: Lens::BrownConrady([-0.05, 0.0, 1e-4, -1e-4, 0.0, 0.0, 0.0, 0.0]),
+        camera_from_world,
+        translation: -(camera_from_world * Vector3::new(x, 0.0, z)),
+    };
+    Rig { cameras: [(0.0, 1.0), (0.3, 1.0), (0.0, 1.3)].map(camera).to_vec(), up: Up::Z }
+}
+
+/// A walk along x, a little towards the cameras, with weights of one standard deviation.
+fn walker(curve: &Curve, frames: usize, fps: f64) -> State {
+    let shape = Shape::template(1.74);
+    let forward = Vector3::new(0.95, -0.3, 0.0).normalize();
+    let axes = Matrix3::from_columns(&[Vector3::z().cross(&forward), Vector3::z(), forward]);
+    let carriers = (0..frames).map(|t| {
+        let time_s = (t as f64 - 0.5 * (frames - 1) as f64) / fps;
+        Carrier {
+            position: Vector3::new(0.0, DISTANCE_M, shape.hip_height_m()) + forward * (1.2 * time_s),
+            world_from_carrier: UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes)),
+            phase: 0.4 + 0.9 * time_s,
+        }
+    });
+    let weights = curve.eigenvalues.iter().enumerate().map(|(i, lambda)| lambda.sqrt() * if i % 3 == 1 { -1.0 } else { 1.0 });
+    State { carriers: carriers.collect(), weights: weights.collect(), shape, posture: Turns::default(), deviations: Vec::new() }
+}
+
+fn positions(state: &State, poses: &[Pose]) -> Vec<[Vector3<f64>; NODES]> {
+    let offsets = state.shape.offsets();
+    poses.iter().map(|p| place(&offsets, p).positions).collect()
+}
+
+fn poses(state: &State, curve: &Curve) -> Vec<Pose> {
+    (0..state.carriers.len()).map(|t| state.pose(curve, t)).collect()
+}
+
+#[test]
+fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
+    let (model, rig, fps) = (model(), rig(), 20.0);
+    let curve = Curve::new(&model, 8);
+    let truth = walker(&curve, 26, fps);
+    let true_poses = poses(&truth, &curve);
+    let (surface, offsets) = (Surface::new(&truth.shape), truth.shape.offsets());
+    let group = &groups(&rig).unwrap()[0];
+    let options = SightOptions { step_px: 4, ..SightOptions::default() };
+    let observe = |(number, pose): (usize, &Pose)| {
+        let figure = Figure::new(&surface, &offsets, &place(&offsets, pose));
+        let points = sighting::points(&figure, group, number, &options).into_iter();
+        let point = |(position, covariance)| CloudPoint { position, colour: [0; 3], confidence: 1.0, covariance };
+        Observation {
+            number,
+            time_s: number as f64 / fps,
+            cloud: Cloud { points: points.map(point).collect() },
+            masks: sighting::masks(&figure, &rig, number, &options).into_iter().map(Some).collect(),
+        }
+    };
+    let observations: Vec<Observation> = true_poses.par_iter().enumerate().map(observe).collect();
+    let floor = true_poses.iter().map(|p| staging::lowest_m(&surface, &place(&offsets, p), rig.up)).fold(f64::INFINITY, f64::min);
+    let found = fit(&observations, &rig, &model, Some(floor), &FitOptions { components: 8, ..FitOptions::default() }, &|_| true).unwrap();
+    let errors = joint_errors(&positions(&found.state, &found.poses), &positions(&truth, &true_poses));
+    assert!(errors.absolute_m < 0.012 && errors.swapped_over_straight > 3.0, "{errors:?}");
+    for (a, b) in found.state.carriers.iter().zip(&truth.carriers) {
+        let apart = (a.phase - b.phase + 0.5).rem_euclid(1.0) - 0.5;
+        assert!(apart.abs() < 0.02 && (a.position - b.position).norm() < 0.03, "{apart} {}", a.position - b.position);
+        assert!(a.world_from_carrier.angle_to(&b.world_from_carrier) < 0.08);
+    }
+    // One standard deviation each: a fit that says nothing would be off by 1.
+    let off = |i: usize| (found.state.weights[i] - truth.weights[i]) / curve.eigenvalues[i].sqrt();
+    let rms = ((0..8).map(|i| off(i).powi(2)).sum::<f64>() / 8.0).sqrt();
+    assert!(rms < 0.4, "{rms}: {:?}", (0..8).map(off).collect::<Vec<_>>());
+}
+
+/// Points of the skin as seen from the middle of the cameras, exact.
+fn exact_points(skin: &PosedSurface, figure: &Figure, eye: &Vector3<f64>, about: &Vector3<f64>) -> Vec<Target> {
+    let mut seen = figure.seen_from(eye);
+    let grid = (-14..15).flat_map(|i| (-34..35).map(move |k| (0.04 * f64::from(i), 0.028 * f64::from(k))));
+    let rays = grid.map(|(x, z)| (about + Vector3::new(x, 0.0, z) - eye).normalize());
+    let hit = |ray: Vector3<f64>| {
+        let mut along = seen.first_hit(&ray)?;
+        for _ in 0..20 {
+            let here = skin.evaluate(&(eye + ray * along));
+            along -= here.distance() / (here.gradient.normalize().dot(&ray)).min(-0.1);
+        }
+        let x = eye + ray * along;
+        (skin.distance(&x).abs() < 1e-12).then_some(Target::Point { x, covariance: Matrix3::zeros() })
+    };
+    rays.filter_map(hit).collect()
+}
+
+#[test]
+fn exact_points_give_exact_weights_when_nothing_else_pulls() {
+    let model = model();
+    let curve = Curve::new(&model, 10);
+    let truth = walker(&curve, 12, 10.0);
+    let eye = Vector3::new(0.1, 0.0, 1.1);
+    let (surface, offsets) = (Surface::new(&truth.shape), truth.shape.offsets());
+    let frame = |t: usize| {
+        let placement = place(&offsets, &truth.pose(&curve, t));
+        let skin = PosedSurface::new(&surface, &placement);
+        let figure = Figure::new(&surface, &offsets, &placement);
+        let targets = exact_points(&skin, &figure, &eye, &placement.position(Joint::Root));
+        Frame { time_s: 0.1 * t as f64, targets, outsides: Arc::default() }
+    };
+    let frames: Vec<Frame> = (0..truth.carriers.len()).map(frame).collect();
+    assert!(frames.iter().all(|f| f.targets.len() > 100), "{:?}", frames.iter().map(|f| f.targets.len()).collect::<Vec<_>>());
+    // Weights so large that the priors, which stay at 1, do not count.
+    let none = 1e9;
+    let settings = Settings {
+        model_m: 0.05,
+        point_weight: 1e14,
+        ray_weight: 1.0,
+        outside_weight: 0.0,
+        acceleration: none,
+        angular_acceleration: none,
+        phase_acceleration: none,
+        tilt: none,
+        stature: none,
+        length: none,
+        arm_length: none,
+        width: none,
+        posture: none,
+        deviation: none,
+        turn_acceleration: none,
+    };
+    let known = Known { viewpoint: eye, up: Vector3::z(), stature_m: 1.74, floor_m: None };
+    let free = Free { rotation: true, phase: true, weights: true, ..Free::default() };
+    let mut state = truth.clone();
+    state.weights.fill(0.0);
+    for carrier in &mut state.carriers {
+        carrier.position += Vector3::new(0.01, -0.015, 0.01);
+        carrier.phase += 0.01;
+    }
+    for _ in 0..40 {
+        let problem = Problem::new(&curve, &frames, &settings, free, &known, &state);
+        state = minimise(problem, state, &LmOptions { max_iterations: 4, relative_cost: 1e-14 }).0;
+    }
+    for ((found, expected), lambda) in state.weights.iter().zip(&truth.weights).zip(&curve.eigenvalues) {
+        assert!((found - expected).abs() < 1e-6 * lambda.sqrt(), "{found} {expected} {}", lambda.sqrt());
+    }
+}
