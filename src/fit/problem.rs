@@ -121,6 +121,9 @@ pub struct Problem<'a> {
 /// Precision of the floor times the share of new information per primitive: 15 mm, 0.3.
 const SUNKEN_WEIGHT: f64 = 0.3 / (0.015 * 0.015);
 
+/// Precision of what may not move: its variance is nought.
+const PINNED: f64 = 1e24;
+
 impl<'a> Problem<'a> {
     pub fn new(curve: &'a Curve, frames: &'a [Frame], settings: &'a Settings, free: Free, known: &'a Known, state: &State) -> Problem<'a> {
         let body = Surface::new(&state.shape);
@@ -356,7 +359,7 @@ impl<'a> Problem<'a> {
             if !free {
                 normal.shared.row_mut(i).fill(0.0);
                 normal.shared.column_mut(i).fill(0.0);
-                normal.shared[(i, i)] = 1.0;
+                normal.shared[(i, i)] = PINNED;
                 normal.border.column_mut(i).fill(0.0);
                 normal.shared_gradient[i] = 0.0;
             }

@@ -50,12 +50,15 @@ const HALF_WIDTH: f64 = 1.96;
 /// Errors over their standard deviations.
 #[derive(Default)]
 struct Scores {
-    kinds: [(Vec<f64>, Vec<f64>); 6],
+    kinds: [(Vec<f64>, Vec<f64>); KINDS.len()],
 }
 
-const KINDS: [(&str, &str, f64); 6] = [
+/// Kind, unit, and how many of it make one in the fit's own.
+const KINDS: [(&str, &str, f64); 8] = [
     ("weights", "population sd", 1.0),
-    ("shape", "%", 100.0),
+    ("stature", "%", 100.0),
+    ("limb lengths", "%", 100.0),
+    ("limb widths", "%", 100.0),
     ("root position", "mm", 1e3),
     ("root rotation", "deg", 57.295_779_513),
     ("phase", "% of a cycle", 100.0),
@@ -172,22 +175,22 @@ impl Scores {
         self.push(1, (found.shape.stature_m / truth.shape.stature_m).ln(), sigma(layout.stature()), 1.0);
         for i in 0..Length::COUNT {
             let at = layout.stature() + 1 + i;
-            self.push(1, found.shape.lengths[i] - truth.shape.lengths[i], sigma(at), 1.0);
-            self.push(1, found.shape.widths[i] - truth.shape.widths[i], sigma(at + Length::COUNT), 1.0);
+            self.push(2, found.shape.lengths[i] - truth.shape.lengths[i], sigma(at), 1.0);
+            self.push(3, found.shape.widths[i] - truth.shape.widths[i], sigma(at + Length::COUNT), 1.0);
         }
         for (t, (a, b)) in found.carriers.iter().zip(&truth.carriers).enumerate() {
             let local = &uncertainty.frames[t].local;
             let turn = (a.world_from_carrier * b.world_from_carrier.inverse()).scaled_axis();
             for axis in 0..3 {
-                self.push(2, a.position[axis] - b.position[axis], local[3 + axis], 1.0);
-                self.push(3, turn[axis], local[axis], 1.0);
+                self.push(4, a.position[axis] - b.position[axis], local[3 + axis], 1.0);
+                self.push(5, turn[axis], local[axis], 1.0);
             }
-            self.push(4, (a.phase - b.phase + 0.5).rem_euclid(1.0) - 0.5, local[6], 1.0);
+            self.push(6, (a.phase - b.phase + 0.5).rem_euclid(1.0) - 0.5, local[6], 1.0);
         }
         for (t, (a, b)) in positions(fit.shape(), &fit.poses).iter().zip(&take.truth).enumerate() {
             for joint in SCORED.map(|j: Joint| j as usize) {
                 let error = a[joint] - b[joint];
-                (0..3).for_each(|axis| self.push(5, error[axis], uncertainty.frames[t].joints_m[joint][axis], 1.0));
+                (0..3).for_each(|axis| self.push(7, error[axis], uncertainty.frames[t].joints_m[joint][axis], 1.0));
             }
         }
         Ok(())
@@ -198,13 +201,14 @@ impl Scores {
             "{} fits to {} people of the model, {} px of disparity noise; intervals of 95 %",
             args.repeats, args.people, args.disparity_noise
         );
-        println!("{:<18}{:>12}{:>14}{:>14}{:>18}", "", "inside %", "rms error/sd", "mean error", "unit");
+        println!("{:<18}{:>12}{:>14}{:>15}{:>14}{:>18}", "", "inside %", "rms error/sd", "mean error/sd", "mean error", "unit");
         for ((normalised, errors), (name, unit, factor)) in self.kinds.iter().zip(KINDS) {
             let count = normalised.len().max(1) as f64;
             let inside = normalised.iter().filter(|z| z.abs() < HALF_WIDTH).count();
             let rms = (normalised.iter().map(|z| z * z).sum::<f64>() / count).sqrt();
+            let bias = normalised.iter().sum::<f64>() / count;
             let mean = factor * errors.iter().sum::<f64>() / count;
-            println!("{name:<18}{:>12.1}{rms:>14.2}{mean:>14.2}{unit:>18}", 100.0 * inside as f64 / count);
+            println!("{name:<18}{:>12.1}{rms:>14.2}{bias:>15.2}{mean:>14.2}{unit:>18}", 100.0 * inside as f64 / count);
         }
     }
 }
