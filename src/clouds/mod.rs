@@ -1,5 +1,6 @@
 //! Point clouds by three-view correlation stereo.
 
+mod candidates;
 pub mod cloud;
 pub mod correlate;
 pub mod edges;
