@@ -21,21 +21,29 @@ pub fn unique(scores: Scores, ratio: f32) -> bool {
     f32::from(scores[3]) > f32::from(scores[1]) * (1.0 + ratio)
 }
 
-/// Set beside the views' own bits where any contradicts.
-const CONTRADICTED: u8 = 1 << 7;
-
 /// Bits of the views that confirm each pixel of row `y` of a region, none where any contradicts.
 pub fn confirm(best: &[u16], owners: &[Owners], y: usize, tolerance: u16, bits: &mut [u8]) {
-    for (k, owners) in owners.iter().enumerate() {
-        let keys = &owners.keys[y * owners.width..];
-        for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
-            let Some(shift) = owners.shifts.get(usize::from(h)) else { continue };
-            let owner = !keys[x + *shift as usize] as u16;
-            *bits |= u8::from(owner.abs_diff(h) <= tolerance) << k;
-            *bits |= if owner < h.saturating_sub(tolerance) { CONTRADICTED } else { 0 };
-        }
+    match owners {
+        [one] => confirm_row([one], best, y, tolerance, bits),
+        [one, other] => confirm_row([one, other], best, y, tolerance, bits),
+        _ => bits.fill(0),
     }
-    bits.iter_mut().for_each(|bits| *bits = if *bits & CONTRADICTED != 0 { 0 } else { *bits });
+}
+
+#[inline(always)]
+fn confirm_row<const VIEWS: usize>(owners: [&Owners; VIEWS], best: &[u16], y: usize, tolerance: u16, bits: &mut [u8]) {
+    let rows = owners.map(|owners| (&owners.keys[y * owners.width..], &owners.shifts[..]));
+    let tolerance = i32::from(tolerance);
+    for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
+        let (mut found, mut contradicted) = (0, false);
+        for (k, (keys, shifts)) in rows.iter().enumerate() {
+            let Some(shift) = shifts.get(usize::from(h)) else { continue };
+            let above = i32::from(!keys[x + *shift as usize] as u16) - i32::from(h) + tolerance;
+            found |= u8::from(above as u32 <= 2 * tolerance as u32) << k;
+            contradicted |= above < 0;
+        }
+        *bits = if contradicted { 0 } else { found };
+    }
 }
 
 /// For every place of another view, the cheapest winner that leads to it.
