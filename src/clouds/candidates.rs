@@ -266,8 +266,15 @@ mod tests {
         let image = noise();
         let padded = Padded { x: -3..58, y: 2..44 };
         // Weights off the axes are 16ths of a pixel: 62 grey levels between neighbours leave at most 4.
-        let cases =
-            [([-1.0, 0.0], 0.0), ([1.0, 0.0], 0.0), ([0.0, -1.0], 0.0), ([0.0, 1.0], 0.0), ([-1.0, 1.0], 0.0), ([0.0, 0.5], 0.5), ([-0.7, 0.2], 4.0)];
+        let cases = [
+            ([-1.0, 0.0], 0.0),
+            ([1.0, 0.0], 0.0),
+            ([0.0, -1.0], 0.0),
+            ([0.0, 1.0], 0.0),
+            ([-1.0, 1.0], 0.0),
+            ([0.0, 0.5], 0.5),
+            ([-0.7, 0.2], 4.0),
+        ];
         for (step, tolerance) in cases {
             let candidates = Candidates::new(&image, step.into(), &padded, 4, 32);
             for y in 0..padded.y.len() {

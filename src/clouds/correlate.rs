@@ -247,7 +247,16 @@ impl<const N: usize> Rows<N> {
         let (padded, row) = (vec![[[0; LANES]; N]; job.width], vec![[[0; LANES]; N]; job.region.width()]);
         let down_least = vec![0; row.len()];
         let ring = vec![padded.clone(); 2 * job.radius + 1];
-        Self { ring, columns: padded, means: row.clone(), down: row.clone(), down_least, sums: row, whole: vec![[u8::MAX; LANES]; N + 2], scratch: Default::default() }
+        Self {
+            ring,
+            columns: padded,
+            means: row.clone(),
+            down: row.clone(),
+            down_least,
+            sums: row,
+            whole: vec![[u8::MAX; LANES]; N + 2],
+            scratch: Default::default(),
+        }
     }
 
     /// Padded row `y` takes the place of the oldest in the columns.

@@ -7,6 +7,7 @@ pub mod edges;
 pub mod frame;
 mod lanes;
 pub mod prefilter;
+pub mod smooth;
 pub mod stage;
 pub mod stereo;
 pub mod subpixel;

@@ -2,6 +2,7 @@
 
 use super::correlate::{Pair, Region, Scores, correlate};
 use super::prefilter;
+use super::smooth::smooth;
 use super::subpixel::equiangular;
 use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
@@ -85,6 +86,7 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
         believe_row(&bar, best, &matches.scores[row], confirmed, &mut values[region.x[0]..region.x[1]]);
     });
     validate::remove_speckles(&mut disparity, options.speckle_area_px, options.speckle_step_px);
+    smooth(&mut disparity);
     ViewDisparity { disparity, confirmed }
 }
 
