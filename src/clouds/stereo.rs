@@ -49,6 +49,16 @@ pub struct ViewDisparity {
     pub confirmed: Vec<u8>,
 }
 
+/// Disparities of the whole first view, averaged over their surfaces ([`super::smooth`]), px; NaN where no match stands.
+/// `range` first..=last, px.
+pub fn disparity_map(views: &[StereoView], range: [usize; 2], options: &StereoOptions) -> Plane {
+    let Some(first) = views.first() else { return Plane::default() };
+    let [width, height] = [first.plane.width(), first.plane.height()].map(|size| size as usize);
+    let mut found = match_view(views, 0, Region { x: [0, width], y: [0, height] }, range, options);
+    smooth(&mut found.disparity);
+    found.disparity
+}
+
 /// Matches every view against the others; `regions` say where each is searched, `range` the disparities first..=last.
 pub fn match_views(views: &[StereoView], regions: &[Region], range: [usize; 2], options: &StereoOptions) -> Vec<ViewDisparity> {
     (0..views.len()).map(|k| match_view(views, k, regions[k], range, options)).collect()
@@ -86,7 +96,6 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
         believe_row(&bar, best, &matches.scores[row], confirmed, &mut values[region.x[0]..region.x[1]]);
     });
     validate::remove_speckles(&mut disparity, options.speckle_area_px, options.speckle_step_px);
-    smooth(&mut disparity);
     ViewDisparity { disparity, confirmed }
 }
 

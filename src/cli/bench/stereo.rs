@@ -5,8 +5,7 @@
 
 use super::super::interrupt;
 use anyhow::{Context, Result, ensure};
-use muybridge::clouds::correlate::Region;
-use muybridge::clouds::stereo::{StereoOptions, StereoView, match_view};
+use muybridge::clouds::stereo::{StereoOptions, StereoView, disparity_map};
 use muybridge::rig::rectify::Plane;
 use nalgebra::{Matrix2, Vector2};
 use opencv::calib3d::{StereoBM, StereoSGBM, StereoSGBM_MODE_SGBM, StereoSGBM_MODE_SGBM_3WAY};
@@ -215,10 +214,8 @@ fn view(plane: Plane, step: [f64; 2]) -> StereoView {
 
 /// Our disparities of the first view, 0 where there is none.
 fn ours(views: &[StereoView], disparities: usize) -> Vec<f32> {
-    let (width, height) = views[0].plane.dimensions();
-    let all = Region { x: [0, width as usize], y: [0, height as usize] };
-    let found = match_view(views, 0, all, [0, disparities - 1], &StereoOptions::default());
-    found.disparity.iter().map(|d| if d.is_nan() { 0.0 } else { *d }).collect()
+    let found = disparity_map(views, [0, disparities - 1], &StereoOptions::default());
+    found.iter().map(|d| if d.is_nan() { 0.0 } else { *d }).collect()
 }
 
 /// OpenCV's matchers, with the same checks.
@@ -319,9 +316,7 @@ fn fastest<const N: usize>(rounds: usize, mut contestants: [&mut dyn FnMut() -> 
 }
 
 fn matched(views: &[StereoView], disparities: usize, radius: usize) -> Result<()> {
-    let (width, height) = views[0].plane.dimensions();
-    let all = Region { x: [0, width as usize], y: [0, height as usize] };
-    std::hint::black_box(match_view(views, 0, all, [0, disparities - 1], &StereoOptions { radius, ..StereoOptions::default() }));
+    std::hint::black_box(disparity_map(views, [0, disparities - 1], &StereoOptions { radius, ..StereoOptions::default() }));
     Ok(())
 }
 
