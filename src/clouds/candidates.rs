@@ -253,7 +253,7 @@ mod tests {
         for (u, v) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)].map(|(i, j)| (x.floor() + i, y.floor() + j)) {
             let weight = (1.0 - (x - u).abs()) * (1.0 - (y - v).abs());
             if weight > 1e-9 {
-                let inside = u >= 0.0 && v >= 0.0 && u < SIZE[0].into() && v < SIZE[1].into();
+                let inside = u >= 0.0 && v >= 0.0 && u < f64::from(SIZE[0]) && v < f64::from(SIZE[1]);
                 let value = if inside { image.get_pixel(u as u32, v as u32).0[0] } else { 0 };
                 sum += weight * if value == 0 { f64::NAN } else { value.into() };
             }

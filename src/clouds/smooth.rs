@@ -86,7 +86,7 @@ mod tests {
     fn by_definition(plane: &Plane, [dx, dy]: [i64; 2]) -> Plane {
         Plane::from_fn(plane.width(), plane.height(), |x, y| {
             let here = plane.get_pixel(x, y).0[0];
-            let inside = |(u, v): &(i64, i64)| *u >= 0 && *v >= 0 && *u < plane.width().into() && *v < plane.height().into();
+            let inside = |(u, v): &(i64, i64)| *u >= 0 && *v >= 0 && *u < i64::from(plane.width()) && *v < i64::from(plane.height());
             let line = (-3..=3).map(|k| (i64::from(x) + k * dx, i64::from(y) + k * dy)).filter(inside);
             let near: Vec<f32> = line.map(|(u, v)| plane.get_pixel(u as u32, v as u32).0[0]).filter(|d| (d - here).abs() <= 1.0).collect();
             Luma([if here.is_nan() { here } else { near.iter().sum::<f32>() / near.len() as f32 }])

@@ -177,7 +177,7 @@ fn join(parents: &mut [u32], a: usize, b: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clouds::correlate::Region;
+    use crate::clouds::correlate::{NO_MATCH, Region};
     use image::Luma;
     use nalgebra::Vector2;
 
