@@ -54,9 +54,8 @@ pub struct ViewDisparity {
 pub fn disparity_map(views: &[StereoView], range: [usize; 2], options: &StereoOptions) -> Plane {
     let Some(first) = views.first() else { return Plane::default() };
     let [width, height] = [first.plane.width(), first.plane.height()].map(|size| size as usize);
-    let mut found = match_view(views, 0, Region { x: [0, width], y: [0, height] }, range, options);
-    smooth(&mut found.disparity);
-    found.disparity
+    let found = match_view(views, 0, Region { x: [0, width], y: [0, height] }, range, options);
+    smooth(&found.disparity)
 }
 
 /// Matches every view against the others; `regions` say where each is searched, `range` the disparities first..=last.
