@@ -5,7 +5,7 @@
 //!   c_k(d) = Σ min(|I_k(q + d s_k) − I_0(q)|, T),   c(d) = min(Σ_k c_k, m (min_k c_k + π)),         (1)
 //! as in [`super::correlate`] but on the grey values; d' is taken where c(d') is clearly lower, and with three views the pixel
 //! is dropped where it is lower at all: two views cannot spare these. On the rendered sessions the first removes 6 to 22 % of
-//! the errors above 1 px, the second another 8 to 17 % with 1 % of the pixels. Fails where both sides look alike. Tried and
+//! the errors above 1 px, the second another 10 to 17 % with 1 % of the pixels. Fails where both sides look alike. Tried and
 //! worse: a weighted median over pixels of like grey, which a shirt's folds mislead. Checked against a drawn step with a
 //! textured near side.
 

@@ -2,8 +2,8 @@
 //!
 //!   D'(p) = D(p) + Σ m_q (D(q) − D(p)) / Σ m_q,   m_q = 1 where |D(q) − D(p)| <= t, 0 elsewhere,     (1)
 //! with q the neighbours in the row, then in the column, up to [`REACH_PX`] away: one pixel's rounding and noise go down and no
-//! step between surfaces is crossed. On Middlebury's pairs mean errors fall by 2 to 19 %, most on slanted surfaces seen large,
-//! and the share above 1 px stays or falls; a reach of 4 starts to round off what is thin. Checked against (1) as written.
+//! step between surfaces is crossed. On Middlebury's pairs mean errors fall by 2 to 19 %; of the pixels that StereoBM matches
+//! up to a third fewer are off by more than 1 px, and nowhere 0.03 % more. A reach of 4 starts to round off what is thin. Checked against (1) as written.
 
 use crate::rig::rectify::Plane;
 use rayon::prelude::*;
