@@ -69,7 +69,7 @@ fn the_whole_job_ends_near_the_truth_and_does_not_depend_on_threads() {
         assert!((speed * 3.6 / f64::from(kmh) - 1.0).abs() < 0.01 && (fps - 60.0).abs() < 0.01, "{kmh}: {speed} {fps}");
     }
 
-    for name in ["overlay", "cloud", "depth", "angles", "speeds"] {
+    for name in ["overlay_cam_00", "cloud", "phase", "root", "weights", "depth", "angles", "speeds"] {
         let picture = std::fs::read(output.join(format!("pictures/{name}.png"))).unwrap();
         assert!(picture.starts_with(b"\x89PNG") && picture.len() > 5000, "{name}");
     }

@@ -141,7 +141,8 @@ mod tests {
         };
         assert_eq!((at([25.0, 5.0]), at([80.0, 16.0]), at([25.0, 17.5])), (PALETTE[0], PALETTE[0], PALETTE[1]));
         assert_eq!(at([55.0, 14.5]), WHITE);
-        assert_eq!(at([25.0, 6.5]), faded(PALETTE[0], 0.75));
+        // Lines are blended at their ends.
+        assert!((0..3).all(|k| at([25.0, 6.5])[k].abs_diff(faded(PALETTE[0], 0.75)[k]) < 3));
         assert!(curves("t", "x", "y", &[]).is_ok());
     }
 }
