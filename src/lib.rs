@@ -56,6 +56,8 @@ pub mod style;
 
 pub mod motion;
 
+pub mod animal;
+
 pub mod phantom;
 
 pub mod io;
