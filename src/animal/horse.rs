@@ -81,7 +81,7 @@ impl Gait {
         match self {
             Gait::Walk => 0.62,
             Gait::Canter => 0.40,
-            Gait::Gallop => 0.24,
+            Gait::Gallop => 0.28,
         }
     }
 
@@ -90,7 +90,7 @@ impl Gait {
         match self {
             Gait::Walk => [0.0, 0.5, 0.25, 0.75],
             Gait::Canter => [0.0, 0.24, 0.26, 0.48],
-            Gait::Gallop => [0.0, 0.11, 0.36, 0.47],
+            Gait::Gallop => [0.0, 0.14, 0.30, 0.44],
         }
     }
 
@@ -99,7 +99,7 @@ impl Gait {
         match self {
             Gait::Walk => (21.0, 19.0, 1.0),
             Gait::Canter => (26.0, 25.0, 1.45),
-            Gait::Gallop => (36.0, 34.0, 1.7),
+            Gait::Gallop => (25.0, 25.0, 1.0),
         }
     }
 
@@ -108,7 +108,7 @@ impl Gait {
         match self {
             Gait::Walk => ([0.8, 0.7, 5.0, 5.0], 2.0),
             Gait::Canter => ([6.0, 4.0, 8.0, 9.0], 1.0),
-            Gait::Gallop => ([4.5, 9.0, 9.0, 10.0], 1.0),
+            Gait::Gallop => ([4.5, 7.0, 9.0, 10.0], 1.0),
         }
     }
 }
@@ -305,7 +305,7 @@ mod tests {
                 .map(|k| horse.vertices(&posture(&horse, gait, f64::from(k) / 40.0)).iter().map(|v| v.y).fold(f64::INFINITY, f64::min))
                 .collect();
             let (low, high) = lowest.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), y| (a.min(*y), b.max(*y)));
-            assert!(low > -0.25 && high < 0.35, "{}: {low} {high}", gait.name());
+            assert!(low > -0.2 && high < 0.45, "{}: {low} {high}", gait.name());
             let now = posture(&horse, gait, 0.3);
             let angles = horse.angles_about(&Vector3::x(), &now);
             for (bone, angle) in horse.bones.iter().zip(angles) {

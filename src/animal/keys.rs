@@ -12,10 +12,12 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::math::rbf::kernel_matrix;
 
-/// Sets evaluated before the exact search gives up, a few seconds.
-const MOST_EVALUATIONS: usize = 3_000_000;
+/// Sets evaluated before the exact search gives up: a second or three.
+const MOST_EVALUATIONS: usize = 1_000_000;
 /// κ of two frames that are as good as one.
 const SINGULAR: f64 = 1e9;
+/// Relative difference below which two κ are equal.
+const TIE: f64 = 1e-12;
 
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum KeyError {
@@ -53,12 +55,12 @@ fn select_within(points: &[Vec<f64>], keys: usize, most: usize) -> Result<Select
     if greedy.1 > SINGULAR {
         return Err(KeyError::Alike { keys });
     }
-    let mut search = Search { h: &h, keys, best: None, limit: greedy.1 * (1.0 + 1e-12), evaluations: 0, most };
+    let mut search = Search { h: &h, keys, best: None, limit: greedy.1 * (1.0 + TIE), evaluations: 0, most };
     search.extend(&mut Vec::new(), &(0..points.len()).collect::<Vec<_>>());
     let exact = search.evaluations < most;
     let evaluations = search.evaluations;
     let (mut frames, condition) = match search.best {
-        Some(best) => (best, search.limit),
+        Some(best) => best,
         None => greedy,
     };
     frames.sort_unstable();
@@ -95,7 +97,7 @@ fn extremes(h: &DMatrix<f64>, frames: &[usize]) -> (f64, f64) {
 struct Search<'a> {
     h: &'a DMatrix<f64>,
     keys: usize,
-    best: Option<Vec<usize>>,
+    best: Option<(Vec<usize>, f64)>,
     /// κ to stay below.
     limit: f64,
     evaluations: usize,
@@ -106,8 +108,9 @@ impl Search<'_> {
     /// Tries all completions of `chosen` by later frames out of `candidates`.
     fn extend(&mut self, chosen: &mut Vec<usize>, candidates: &[usize]) {
         if chosen.len() == self.keys {
-            self.limit = condition(self.h, chosen);
-            self.best = Some(chosen.clone());
+            let value = condition(self.h, chosen);
+            self.limit = value * (1.0 - TIE);
+            self.best = Some((chosen.clone(), value));
             return;
         }
         let missing = self.keys - chosen.len();
@@ -198,7 +201,7 @@ fn exchange(h: &DMatrix<f64>, mut set: Vec<usize>) -> (Vec<usize>, f64) {
                 }
                 set[i] = c;
                 let k = condition(h, &set);
-                if k < value * (1.0 - 1e-12) { value = k } else { set[i] = old }
+                if k < value * (1.0 - TIE) { value = k } else { set[i] = old }
             }
         }
         if value >= before {

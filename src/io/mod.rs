@@ -1,5 +1,7 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod animal_clip;
+pub mod animal_json;
 pub mod asf_amc;
 pub mod atomic;
 pub mod bvh;

@@ -160,9 +160,9 @@ mod tests {
     fn peak_and_phase_of_a_known_wave() {
         let wave = |phase: f64| -> Vec<f64> { (0..120).map(|t| 3.0 + (TAU * 7.0 * t as f64 / 120.0 - phase).cos()).collect() };
         let found = peak(&wave(0.0)).unwrap();
-        assert_eq!((found.centre, found.half_width), (7.0, 0.5));
-        assert_eq!(found.band, [5.5, 8.5]);
-        assert!((found.at(8.5) - 0.1).abs() < 1e-12 && found.at(7.0) == 1.0);
+        assert!(found.centre == 7.0 && (found.half_width - 0.5).abs() < 1e-9);
+        assert!((found.band[0] - 5.5).abs() < 1e-9 && (found.band[1] - 8.5).abs() < 1e-9);
+        assert!((found.at(8.5) - 0.1).abs() < 1e-9 && found.at(7.0) == 1.0);
         for lag in [-1.2, 0.4, std::f64::consts::FRAC_PI_2] {
             assert!((phase_lag(&wave(0.3), &wave(0.3 + lag), 7) - lag).abs() < 1e-9);
         }
