@@ -163,7 +163,7 @@ fn drawings_are_saved_copied_undone_and_kept() {
     browser.drag(&[[40.0, 50.0], [45.0, 100.0]]);
     browser.wait("drawing.strokes.length === 2");
     let first = out.join("000000.png");
-    let saved = |n: usize| browser.wait(&format!("fetch, drawing.strokes.length === {n}"));
+    let saved = |n: usize| browser.wait(&format!("drawing.strokes.length === {n}"));
     saved(2);
     browser.script("return saving;");
     assert!(on(&first, 70, 38) && on(&first, 42, 75) && !on(&first, 70, 80));

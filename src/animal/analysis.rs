@@ -39,8 +39,8 @@ fn region(mask: &GrayImage, near: Option<[f64; 2]>, strokes: bool) -> Option<(Gr
     (n > 0).then(|| (mask.clone(), Region { area_px: n, centre_px: sum.map(|s| s / n as f64), bounds_px: bounds, second_px: None }))
 }
 
-/// Analyses masks (or drawn strokes) of successive frames.
-pub fn analyse(masks: &[GrayImage], strokes: bool) -> Result<Analysis, AnalysisError> {
+/// Analyses masks (or drawn strokes) of successive frames; trends up to a degree are taken away (see [`eigenimages`]).
+pub fn analyse(masks: &[GrayImage], strokes: bool, trend_degree: usize) -> Result<Analysis, AnalysisError> {
     let (mut cleaned, mut regions, mut near) = (Vec::new(), Vec::new(), None);
     for (frame, mask) in masks.iter().enumerate() {
         let (only, region) = region(mask, near, strokes).ok_or(AnalysisError::Nothing(frame))?;
@@ -50,7 +50,7 @@ pub fn analyse(masks: &[GrayImage], strokes: bool) -> Result<Analysis, AnalysisE
     }
     let size = window_size(&regions);
     let windows: Vec<GrayImage> = cleaned.iter().zip(&regions).map(|(m, r)| window(m, r.centre_px, size)).collect();
-    let eigen = eigenimages(&windows, COMPONENTS)?;
+    let eigen = eigenimages(&windows, COMPONENTS, trend_degree)?;
     let rhythm = rhythm(&eigen, strokes);
     Ok(Analysis { regions, windows, eigen, rhythm })
 }
@@ -58,7 +58,7 @@ pub fn analyse(masks: &[GrayImage], strokes: bool) -> Result<Analysis, AnalysisE
 /// Silhouettes of another clip of the same species in the windows of a known basis: scaled by the ratio of the median root
 /// areas, centred, and turned over where `mirrored`.
 pub fn fitted_windows(masks: &[GrayImage], basis: &[GrayImage], mirrored: bool) -> Result<Vec<GrayImage>, AnalysisError> {
-    let own = analyse(masks, false)?;
+    let own = analyse(masks, false, 0)?;
     let area = |list: &[GrayImage]| {
         let mut areas: Vec<usize> = list.iter().map(|m| m.iter().filter(|p| **p > 127).count()).collect();
         areas.sort_unstable();
@@ -94,18 +94,18 @@ mod tests {
     #[test]
     fn a_gallop_is_usable_and_a_missing_frame_named() {
         let mut masks = gallop(100, 45.0, [180, 140]);
-        let found = analyse(&masks, false).unwrap();
+        let found = analyse(&masks, false, 0).unwrap();
         assert_eq!(found.rhythm.verdict, Verdict::Usable, "{:?}", found.rhythm);
         assert!((found.rhythm.period_frames.unwrap() - 12.5).abs() < 0.3);
         assert!(found.windows.iter().all(|w| w.dimensions() == found.windows[0].dimensions()));
         masks[7] = GrayImage::new(180, 140);
-        assert!(analyse(&masks, false).unwrap_err().to_string().starts_with("frame 7 has no silhouette"));
-        assert!(analyse(&masks[..1], false).is_err());
+        assert!(analyse(&masks, false, 0).unwrap_err().to_string().starts_with("frame 7 has no silhouette"));
+        assert!(analyse(&masks[..1], false, 0).is_err());
     }
 
     #[test]
     fn another_clip_at_another_size_projects_to_the_same_coefficients() {
-        let known = analyse(&gallop(40, 60.0, [240, 180]), false).unwrap();
+        let known = analyse(&gallop(40, 60.0, [240, 180]), false, 0).unwrap();
         let mirrored: Vec<GrayImage> = gallop(40, 42.0, [200, 160]).iter().map(image::imageops::flip_horizontal).collect();
         let fitted = fitted_windows(&mirrored, &known.windows, true).unwrap();
         for t in 0..40 {

@@ -4,6 +4,8 @@
 //!   E = Iᵀ V D^(−1/2)/√n,   p_k(t) = (i(t) − ī)·E_k/√D_k = √n V_tk                                        (1)
 //! so that coefficients have unit variance (Favreau et al. 2004, equations 1 to 5). Binary images make the Gram matrix
 //! counts of common pixels, taken from bit sets, exact and then centred. Sign: the largest |entry| of E_k is positive.
+//! An animal that turns or comes nearer drifts: with Q an orthonormal basis of the polynomials of time up to a degree,
+//! T = 1 − QQᵀ takes every pixel's trend away, (1/n) T I Iᵀ T its Gram matrix (degree 0 is the mean, as in the paper).
 //! Checked against nalgebra's SVD, math::pca and cv::PCACompute.
 
 use image::GrayImage;
@@ -36,8 +38,9 @@ pub struct Eigenimages {
     pub coefficients: DMatrix<f64>,
 }
 
-/// PCA of masks (pixels above 127 are 1) of one size, with at most `components` components.
-pub fn eigenimages(masks: &[GrayImage], components: usize) -> Result<Eigenimages, EigenError> {
+/// PCA of masks (pixels above 127 are 1) of one size, with at most `components` components, every pixel's polynomial trend
+/// of a degree taken away; degree 0 takes the mean.
+pub fn eigenimages(masks: &[GrayImage], components: usize, trend_degree: usize) -> Result<Eigenimages, EigenError> {
     let n = masks.len();
     if n < 3 {
         return Err(EigenError::TooFew(n));
@@ -46,7 +49,7 @@ pub fn eigenimages(masks: &[GrayImage], components: usize) -> Result<Eigenimages
     if let Some((frame, other)) = masks.iter().enumerate().find(|(_, m)| m.dimensions() != (width, height)) {
         return Err(EigenError::Size { frame, found: other.dimensions(), wanted: (width, height) });
     }
-    let eigen = centred_gram(masks).symmetric_eigen();
+    let eigen = gram_without(masks, &trends(n, trend_degree)).symmetric_eigen();
     let mut order: Vec<usize> = (0..n).collect();
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
     let largest = eigen.eigenvalues[order[0]];
@@ -72,15 +75,23 @@ pub fn eigenimages(masks: &[GrayImage], components: usize) -> Result<Eigenimages
     Ok(Eigenimages { size_px: [width, height], mean, images, eigenvalues, coefficients: vectors * (n as f64).sqrt() })
 }
 
-/// (1/n) I Iᵀ from numbers of common pixels.
-fn centred_gram(masks: &[GrayImage]) -> DMatrix<f64> {
+/// Orthonormal polynomials of time of degrees 0 … `degree`, one column each.
+fn trends(n: usize, degree: usize) -> DMatrix<f64> {
+    let time = |t: usize| 2.0 * t as f64 / (n - 1) as f64 - 1.0;
+    DMatrix::from_fn(n, (degree + 1).min(n - 1), |t, k| time(t).powi(k as i32)).qr().q()
+}
+
+/// (1/n) T I Iᵀ T from numbers of common pixels.
+fn gram_without(masks: &[GrayImage], trends: &DMatrix<f64>) -> DMatrix<f64> {
     let n = masks.len();
     let bits: Vec<Vec<u64>> = masks.par_iter().map(|m| m.as_raw().chunks(64).map(word).collect()).collect();
     let common = |a: &[u64], b: &[u64]| a.iter().zip(b).map(|(a, b)| (a & b).count_ones()).sum::<u32>();
     let rows: Vec<Vec<f64>> = bits.par_iter().map(|a| bits.iter().map(|b| f64::from(common(a, b))).collect()).collect();
-    let means: Vec<f64> = rows.iter().map(|r| r.iter().sum::<f64>() / n as f64).collect();
-    let all = means.iter().sum::<f64>() / n as f64;
-    DMatrix::from_fn(n, n, |i, j| (rows[i][j] - means[i] - means[j] + all) / n as f64)
+    let gram = DMatrix::from_fn(n, n, |i, j| rows[i][j] / n as f64);
+    let keep = DMatrix::identity(n, n) - trends * trends.transpose();
+    let kept = &keep * gram * &keep;
+    // Symmetric to the last bit.
+    (&kept + kept.transpose()) * 0.5
 }
 
 fn word(pixels: &[u8]) -> u64 {
@@ -158,7 +169,7 @@ pub(crate) mod tests {
     #[test]
     fn agrees_with_svd_and_with_the_general_pca() {
         let masks = pendulum(17);
-        let found = eigenimages(&masks, 5).unwrap();
+        let found = eigenimages(&masks, 5, 0).unwrap();
         let general = crate::math::pca::pca(&matrix(&masks));
         let mut centred = matrix(&masks);
         let mean = centred.column_mean();
@@ -179,9 +190,27 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn trends_are_taken_from_every_pixel() {
+        let masks = pendulum(20);
+        let found = eigenimages(&masks, 3, 2).unwrap();
+        // Pixel by pixel: residuals of a least-squares parabola, then the general PCA.
+        let mut pixels = matrix(&masks).transpose();
+        let design = DMatrix::from_fn(20, 3, |t, k| (t as f64).powi(k as i32));
+        let fit = (design.transpose() * &design).try_inverse().unwrap() * design.transpose();
+        let trend = &design * (fit * &pixels);
+        pixels -= trend;
+        let general = crate::math::pca::pca(&pixels.transpose());
+        let plain = eigenimages(&masks, 3, 0).unwrap();
+        for k in 0..3 {
+            assert!((found.eigenvalues[k] - general.eigenvalues[k]).abs() < 1e-7 && (found.eigenvalues[k] - plain.eigenvalues[k]).abs() > 1e-3);
+            assert!((found.images.column(k).dot(&general.basis.column(k)).abs() - 1.0).abs() < 1e-6, "{k}");
+        }
+    }
+
+    #[test]
     fn agrees_with_opencv() {
         let masks = pendulum(12);
-        let found = eigenimages(&masks, 4).unwrap();
+        let found = eigenimages(&masks, 4, 0).unwrap();
         let rows: Vec<f64> = masks.iter().flat_map(|m| m.iter().map(|p| f64::from(*p) / 255.0)).collect();
         let data = Mat::new_rows_cols_with_data(12, masks[0].as_raw().len() as i32, &rows).unwrap().try_clone().unwrap();
         let (mut mean, mut vectors, mut values) = (Mat::default(), Mat::default(), Mat::default());
@@ -196,12 +225,12 @@ pub(crate) mod tests {
     #[test]
     fn pictures_and_bad_input() {
         let masks = pendulum(9);
-        let found = eigenimages(&masks, 2).unwrap();
+        let found = eigenimages(&masks, 2, 0).unwrap();
         assert_eq!(found.picture(0, 0.0).get_pixel(20, 4).0, [255]);
         assert!(found.picture(0, 1.0) != found.picture(0, -1.0));
-        assert!(matches!(eigenimages(&masks[..2], 2), Err(EigenError::TooFew(2))));
-        assert!(matches!(eigenimages(&vec![masks[0].clone(); 6], 2), Err(EigenError::Still)));
+        assert!(matches!(eigenimages(&masks[..2], 2, 0), Err(EigenError::TooFew(2))));
+        assert!(matches!(eigenimages(&vec![masks[0].clone(); 6], 2, 0), Err(EigenError::Still)));
         let odd = [&masks[..], &[GrayImage::new(4, 4)]].concat();
-        assert!(matches!(eigenimages(&odd, 2), Err(EigenError::Size { frame: 9, .. })));
+        assert!(matches!(eigenimages(&odd, 2, 0), Err(EigenError::Size { frame: 9, .. })));
     }
 }

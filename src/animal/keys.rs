@@ -13,7 +13,7 @@ use nalgebra::{DMatrix, DVector};
 use crate::math::rbf::kernel_matrix;
 
 /// Sets evaluated before the exact search gives up: a second or three.
-const MOST_EVALUATIONS: usize = 1_000_000;
+const MOST_EVALUATIONS: usize = 500_000;
 /// κ of two frames that are as good as one.
 const SINGULAR: f64 = 1e9;
 /// Relative difference below which two κ are equal.

@@ -1,10 +1,11 @@
 //! Silhouettes of an animal in a clip from a few rectangles.
 //!
 //! Every pixel's log-odds of being the animal is a sum, at a working size of at most 448 px:
-//!   U = 0.6 [log p(x|F) − log p(x|B)] (clipped at ±3: mixtures of 5 Gaussians in L*a*b*, [`super::mixture`])
+//!   U = w [log p(x|F) − log p(x|B)] (clipped at ±3: mixtures of 5 Gaussians in L*a*b*, [`super::mixture`]; w from 0.6,
+//!       where they confuse 5 % of their own samples or more, to 2, where they confuse none)
 //!     + [(c/s)² − 1] (clipped to −1 … 4: c the change against the scenery, [`super::change`], s three times its median,
 //!       the noise, at least 3)
-//!     + [signed distance to the previous mask, carried along by the optical flow, over 6 px] (−4 … 3)         (1)
+//!     + [signed distance to the previous mask, carried along by the optical flow, over 6 px of 448] (−4 … 3)         (1)
 //! In the frame of the rectangles the last term falls off with the distance from the subject's rectangle. Mean-field
 //! inference of a Potts model whose couplings fall with the colour step (GrabCut's, Rother et al. 2004) smooths U along
 //! edges:  q_i ← tanh(U_i/2 + λ Σ_j w_ij q_j).                                                                (2)
@@ -20,7 +21,7 @@ use super::change::{Scenery, lab};
 use super::mixture::Mixture;
 use super::region::{Region, follow};
 use crate::math::order::quantile;
-use crate::footage::regions::{area_px, dilate, erode, fill_holes, open};
+use crate::footage::regions::{area_px, box_vote, dilate, erode, fill_holes, open};
 
 /// Longer side of the pictures that are worked on.
 const WORKING_PX: u32 = 448;
@@ -30,7 +31,7 @@ const GAUSSIANS: usize = 5;
 const BACKGROUND: f32 = -20.0;
 /// Size of the couplings λ of equation (2).
 const COUPLING: f32 = 1.5;
-const ROUNDS: usize = 15;
+const ROUNDS: usize = 10;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Rectangle {
@@ -215,8 +216,10 @@ struct Run<'a> {
     scenery: &'a Scenery,
     subject: Mixture,
     background: Mixture,
-    /// The rectangles' own colours, to start again from.
-    first: [Mixture; 2],
+    /// w of equation (1).
+    trust: f32,
+    /// The rectangles' own colours, to start again from, and their w.
+    first: ([Mixture; 2], f32),
     /// Middle of the first subject rectangle.
     anchor: [f64; 2],
     previous: Option<GrayImage>,
@@ -235,20 +238,22 @@ impl<'a> Run<'a> {
             }
             Ok(colours)
         };
-        let fit = |subject: bool, name| Mixture::fit(&colours(subject)?, GAUSSIANS, 1).ok_or(MaskError::NoColours(name));
-        let (subject, background) = (fit(true, "subject")?, fit(false, "background")?);
+        let (inside, outside) = (colours(true)?, colours(false)?);
+        let fit = |colours: &[[f32; 3]], name| Mixture::fit(colours, GAUSSIANS, 1).ok_or(MaskError::NoColours(name));
+        let (subject, background) = (fit(&inside, "subject")?, fit(&outside, "background")?);
+        let trust = trust(&subject, &background, &inside, &outside);
         let middle = marks.iter().filter(|m| m.subject).min_by_key(|m| m.frame).map(|m| m.rectangle);
         let anchor = middle.map_or([0.0; 2], |r| [f64::from(r.x) + f64::from(r.width) / 2.0, f64::from(r.y) + f64::from(r.height) / 2.0]);
-        let first = [subject.clone(), background.clone()];
+        let first = ([subject.clone(), background.clone()], trust);
         let seconds = vec![None; frames.len()];
-        Ok(Run { frames, marks, options, scenery, subject, background, first, anchor, previous: None, centre: anchor, seconds })
+        Ok(Run { frames, marks, options, scenery, subject, background, trust, first, anchor, previous: None, centre: anchor, seconds })
     }
 
     /// Before each of the two directions: the anchor's mask, once there is one.
     fn restart(&mut self, anchor: Option<&GrayImage>, centre: [f64; 2]) {
         self.previous = anchor.filter(|m| area_px(m) > 0).cloned();
         self.centre = self.previous.as_ref().and_then(|m| follow(m, None)).map_or(centre, |(_, r)| r.centre_px);
-        [self.subject, self.background] = self.first.clone();
+        ([self.subject, self.background], self.trust) = self.first.clone();
     }
 
     fn maps(&self, frame: usize, from: Option<usize>) -> Result<Maps, MaskError> {
@@ -263,11 +268,11 @@ impl<'a> Run<'a> {
     fn segment(&mut self, frame: usize, maps: &Maps) -> (GrayImage, Vec<f32>) {
         let (width, height) = self.frames[frame].dimensions();
         let prior = match &self.previous {
-            Some(mask) => carried(mask, &maps.flow),
+            Some(mask) => carried(mask, &maps.flow, reach_px(mask, 6.0)),
             None => self.rectangle_prior(frame),
         };
         let noise = noise(&maps.change);
-        let (subject, background) = (&self.subject, &self.background);
+        let (subject, background, trust) = (&self.subject, &self.background, self.trust);
         let mut odds: Vec<f32> = maps
             .lab
             .par_iter()
@@ -276,7 +281,7 @@ impl<'a> Run<'a> {
             .map(|((x, change), prior)| {
                 let colour = (subject.log_density(*x) - background.log_density(*x)).clamp(-3.0, 3.0);
                 let moved = if change.is_nan() { 0.0 } else { ((change / noise).powi(2) - 1.0).clamp(-1.0, 4.0) };
-                0.6 * colour + moved + prior - 0.3
+                trust * colour + moved + prior - 0.3
             })
             .collect();
         for m in self.marks.iter().filter(|m| m.frame == frame) {
@@ -321,14 +326,16 @@ impl<'a> Run<'a> {
 
     /// Colours of the inside and of a ring round the mask.
     fn learn(&mut self, maps: &Maps, mask: &GrayImage) {
-        let inner = erode(mask, 6);
+        let reach = |px: f32| reach_px(mask, px) as u32;
+        let inner = erode(mask, reach(6.0));
         let noise = noise(&maps.change);
-        let (near, far) = (dilate(mask, 3), dilate(mask, 30));
+        let (near, far) = (dilate(mask, reach(3.0)), box_vote(mask, i64::from(reach(30.0)), 0.0));
         let colours = |wanted: &dyn Fn(usize) -> bool| -> Vec<[f32; 3]> { (0..maps.lab.len()).filter(|i| wanted(*i)).map(|i| maps.lab[i]).collect() };
         let inside = colours(&|i| inner.as_raw()[i] > 0 || (mask.as_raw()[i] > 0 && maps.change[i] > 2.5 * noise));
         let inside = if inside.len() > 50 { inside } else { colours(&|i| mask.as_raw()[i] > 0) };
         let round = colours(&|i| far.as_raw()[i] > 0 && near.as_raw()[i] == 0);
         if let (Some(subject), Some(background)) = (Mixture::fit(&inside, GAUSSIANS, 1), Mixture::fit(&round, GAUSSIANS, 1)) {
+            self.trust = trust(&subject, &background, &inside, &round);
             (self.subject, self.background) = (subject, background);
         }
     }
@@ -340,8 +347,24 @@ fn noise(change: &[f32]) -> f32 {
     3.0 * quantile(known, 0.5).unwrap_or(1.0).max(1.0) as f32
 }
 
-/// The previous mask at the places that the flow leads to, as a signed distance over 6 px.
-fn carried(mask: &GrayImage, flow: &[[f32; 2]]) -> Vec<f32> {
+/// Pixels of a picture of the working size, in a smaller one; at least 2.
+fn reach_px(picture: &GrayImage, px: f32) -> f32 {
+    (px * picture.width().max(picture.height()) as f32 / WORKING_PX as f32).max(2.0)
+}
+
+/// w of equation (1), by the share of their own samples that the mixtures confuse.
+fn trust(subject: &Mixture, background: &Mixture, inside: &[[f32; 3]], outside: &[[f32; 3]]) -> f32 {
+    let confused = |samples: &[[f32; 3]], own: &Mixture, other: &Mixture| {
+        let step = (samples.len() / 1000).max(1);
+        let seen: Vec<bool> = samples.iter().step_by(step).map(|x| other.log_density(*x) > own.log_density(*x)).collect();
+        seen.iter().filter(|c| **c).count() as f32 / seen.len().max(1) as f32
+    };
+    let worst = confused(inside, subject, background).max(confused(outside, background, subject));
+    2.0 - 1.4 * (worst / 0.05).min(1.0)
+}
+
+/// The previous mask at the places that the flow leads to, as a signed distance over `reach` px.
+fn carried(mask: &GrayImage, flow: &[[f32; 2]], reach: f32) -> Vec<f32> {
     let (width, height) = (mask.width() as i64, mask.height() as i64);
     let moved = GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
         let [dx, dy] = flow.get((y * mask.width() + x) as usize).copied().unwrap_or([0.0; 2]);
@@ -350,7 +373,7 @@ fn carried(mask: &GrayImage, flow: &[[f32; 2]]) -> Vec<f32> {
         if inside { *mask.get_pixel(sx as u32, sy as u32) } else { Luma([0]) }
     });
     let (inside, outside) = (distance(&moved, true), distance(&moved, false));
-    inside.iter().zip(&outside).map(|(i, o)| ((i - o) / 6.0).clamp(-4.0, 3.0)).collect()
+    inside.iter().zip(&outside).map(|(i, o)| ((i - o) / reach).clamp(-4.0, 3.0)).collect()
 }
 
 /// Chamfer distance (1, √2) of pixels to the nearest one outside (`inside`) or inside the mask; 0 on the other side.

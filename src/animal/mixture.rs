@@ -2,7 +2,7 @@
 //!
 //! r_ik = π_k N(x_i|μ_k,Σ_k)/Σ_l …;  N_k = Σ_i r_ik;  μ_k = Σ r x/N_k;  Σ_k = Σ r (x−μ)(x−μ)ᵀ/N_k + ε I;  π_k = N_k/N.
 //! Start: seeded k-means++ centres and three rounds of k-means. ε = 4 grey² keeps flat colours from collapsing.
-//! Stops when the mean log-likelihood gains less than 1e-5, or after 100 rounds. Checked against cv::ml::EM, and the
+//! Stops when the mean log-likelihood gains less than 1e-4, or after 60 rounds. Checked against cv::ml::EM, and the
 //! likelihood never falls.
 
 use nalgebra::{Matrix3, Vector3};
@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 /// Grey levels²: the noise of a camera.
 const EPSILON: f64 = 4.0;
 /// More samples than this add nothing to 5 colours.
-const MOST_SAMPLES: usize = 4000;
+const MOST_SAMPLES: usize = 2500;
 
 #[derive(Clone, Debug)]
 pub struct Component {
@@ -38,9 +38,9 @@ impl Mixture {
         let points = thinned(samples, &mut random);
         let mut components = start(&points, count, &mut random);
         let mut before = f64::NEG_INFINITY;
-        for _ in 0..100 {
+        for _ in 0..60 {
             let likelihood = round(&points, &mut components);
-            if likelihood - before < 1e-5 {
+            if likelihood - before < 1e-4 {
                 break;
             }
             before = likelihood;

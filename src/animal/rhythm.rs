@@ -76,7 +76,7 @@ fn judge(series: &[Vec<f64>], strokes: bool) -> Rhythm {
                 reasons.push(format!("PC2 runs {lag:.0} degrees after PC1, a quarter period (90) is needed"));
             }
             if peak.centre < 2.0 && !closes(first, second) {
-                reasons.push("one period only, and it does not close: a drift, not a rhythm".into());
+                reasons.push("one period only, and it does not close: a drift (--detrend 3 takes it away), not a rhythm".into());
             }
         }
         _ => reasons.push("PC1 has no peak: nothing repeats".into()),

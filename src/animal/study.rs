@@ -131,7 +131,7 @@ pub fn switching_models(creature: &Creature, take: &Take, analysis: &Analysis, f
 /// Films a motion at 25 frames per second, 320×240, as the paper's synthetic clips, and analyses it.
 pub fn filmed(creature: &Creature, motion: &Motion, frames: usize) -> Result<(Take, Analysis), StudyError> {
     let take = film(creature, motion, frames, 25.0, [320, 240]);
-    let analysis = analyse(&take.masks, false)?;
+    let analysis = analyse(&take.masks, false, 0)?;
     Ok((take, analysis))
 }
 
@@ -177,7 +177,7 @@ mod tests {
     #[test]
     fn strokes_serve_as_well_as_masks() {
         let (creature, take, masks) = gait(Gait::Gallop);
-        let drawn = analyse(&sketch_horse(&creature, &take, 2.0), true).unwrap();
+        let drawn = analyse(&sketch_horse(&creature, &take, 2.0), true, 0).unwrap();
         assert_eq!(drawn.rhythm.verdict, crate::animal::rhythm::Verdict::Usable, "{:?}", drawn.rhythm);
         let error = |a: &Analysis, filter| one_model(&creature, &take, a, 4, 2, filter).unwrap().error.mean_deg;
         println!("gallop from masks {:.2} (filtered {:.2}), from strokes {:.2} ({:.2})", error(&masks, false), error(&masks, true), error(&drawn, false), error(&drawn, true));

@@ -48,6 +48,8 @@ pub struct AnalysisRecord {
     pub strokes: bool,
     /// Whether keys and animation use the band-passed coefficients.
     pub filter: bool,
+    /// Of the polynomial that was taken from every pixel.
+    pub trend_degree: usize,
     /// Number of the first analysed frame.
     pub first_frame: usize,
     pub window_px: [u32; 2],

@@ -164,7 +164,7 @@ mod tests {
         let horse = horse();
         let view = View::side(&horse, [160, 120]);
         let masks: Vec<GrayImage> = (0..40).map(|t| silhouette(&horse, &posture(&horse, Gait::Canter, f64::from(t) / 16.0), &view)).collect();
-        let found = analyse(&masks, false).unwrap();
+        let found = analyse(&masks, false, 0).unwrap();
         let points = found.rhythm.points(&found.eigen, 2, true);
         let sheet = eigenimages(&found.eigen, 3).unwrap();
         assert_eq!(sheet.width(), 3 * 288 + 8);

@@ -34,6 +34,9 @@ pub struct AnalyseChoices {
     /// The pictures are drawn strokes (white, or opaque on transparent), not masks
     #[arg(long)]
     pub strokes: bool,
+    /// Take away every pixel's polynomial trend of this degree: 2 or 3 for an animal that turns or comes nearer
+    #[arg(long, default_value_t = 0, value_name = "DEGREE", value_parser = clap::value_parser!(u8).range(0..=9))]
+    detrend: u8,
     /// Only these frames, FIRST:LAST
     #[arg(long, value_name = "A:B")]
     frames: Option<FrameRange>,
@@ -49,7 +52,7 @@ pub fn run(args: &AnalyseArgs) -> Result<()> {
 pub fn make(masks: &Path, choices: &AnalyseChoices, output: &Path) -> Result<()> {
     let images = read_masks(masks, choices.frames.map(FrameRange::pair))?;
     let first_frame = choices.frames.map_or(0, |r| r.pair().0);
-    let found = analyse(&images, choices.strokes).with_context(|| masks.display().to_string())?;
+    let found = analyse(&images, choices.strokes, usize::from(choices.detrend)).with_context(|| masks.display().to_string())?;
     let seconds = found.regions.iter().filter(|r| r.second_px.is_some()).count();
     if seconds > 0 {
         eprintln!("notice: {seconds} frames show a second region half as large or larger; the nearest one is followed");
@@ -76,6 +79,7 @@ fn record_of(found: &Analysis, fps: f64, choices: &AnalyseChoices, first_frame: 
         fps,
         strokes: choices.strokes,
         filter: choices.filter == Switch::On,
+        trend_degree: usize::from(choices.detrend),
         first_frame,
         window_px: found.eigen.size_px,
         rhythm: found.rhythm.clone(),

@@ -142,19 +142,22 @@ fn alternates(analysed: &Analysed, points: &[Vec<f64>], keys: &[usize], choices:
         let list: Vec<String> = keys.iter().map(|k| (k + first).to_string()).collect();
         bail!("--alternate {}={}: {} is no key; the keys are frames {}", named.key, named.frame, named.key, list.join(", "));
     }
-    keys.iter()
-        .map(|&key| {
-            let named = choices.alternate.iter().find(|n| n.key == key + first).map(|n| n.frame);
-            let frame = match named {
-                Some(frame) => frame.checked_sub(first).filter(|f| *f < points.len() && *f != key).with_context(|| format!("frame {frame} cannot be the alternate of key {}", key + first))?,
-                None => {
-                    let free = candidates(points, turns.as_deref(), key).into_iter().find(|f| !choices.reject.contains(&(f + first)) && !keys.contains(f));
-                    free.with_context(|| format!("key {} has no silhouette in the other half of a stride; take a longer part of the clip, or leave --double out", key + first))?
-                }
-            };
-            Ok(Alternate { key: key + first, frame: frame + first, distance: squared_distance(&points[key], &points[frame]).sqrt() })
-        })
-        .collect()
+    let mut found: Vec<Alternate> = Vec::new();
+    for &key in keys {
+        let named = choices.alternate.iter().find(|n| n.key == key + first).map(|n| n.frame);
+        let free = |f: &usize| !choices.reject.contains(&(f + first)) && !keys.contains(f) && !found.iter().any(|a| a.frame == f + first);
+        let frame = match named {
+            Some(frame) => {
+                let inside = frame.checked_sub(first).filter(|f| *f < points.len() && *f != key);
+                inside.with_context(|| format!("frame {frame} cannot be the alternate of key {}", key + first))?
+            }
+            None => candidates(points, turns.as_deref(), key).into_iter().find(free).with_context(|| {
+                format!("key {} has no silhouette in the other half of a stride; take a longer part of the clip, or leave --double out", key + first)
+            })?,
+        };
+        found.push(Alternate { key: key + first, frame: frame + first, distance: squared_distance(&points[key], &points[frame]).sqrt() });
+    }
+    Ok(found)
 }
 
 /// The choice in words.

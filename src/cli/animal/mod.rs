@@ -167,7 +167,7 @@ fn read_analysis(folder: &Path) -> Result<Analysed> {
     if windows.len() != record.regions.len() {
         bail!("{}: {} windows where analysis.json has {} frames; run `muybridge animal analyse` again", folder.display(), windows.len(), record.regions.len());
     }
-    let eigen = eigenimages(&windows, COMPONENTS)?;
+    let eigen = eigenimages(&windows, COMPONENTS, record.trend_degree)?;
     Ok(Analysed { record, windows, eigen })
 }
 

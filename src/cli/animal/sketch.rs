@@ -44,7 +44,6 @@ struct Drawing {
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 struct Drawn {
     subject: bool,
     #[serde(flatten)]

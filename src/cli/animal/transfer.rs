@@ -42,7 +42,7 @@ pub fn run(args: &TransferArgs) -> Result<()> {
     let creature = glb::read(&args.keys.join("template.glb"))?;
     let poses = read_poses(&creature, &args.choices, places.len())?;
     let masks = read_masks(&args.masks, None)?;
-    let own = analyse(&masks, false).with_context(|| args.masks.display().to_string())?;
+    let own = analyse(&masks, false, 0).with_context(|| args.masks.display().to_string())?;
     let windows = fitted_windows(&masks, &known.windows, args.mirror)?;
     let raw: Vec<Vec<f64>> = windows.iter().map(|w| known.eigen.project(w)[..record.components].to_vec()).collect();
     let points = filtered(&raw, known.record.filter);

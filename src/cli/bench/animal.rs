@@ -87,7 +87,7 @@ fn table(creature: &Creature, take: &Take, analysis: &Analysis, filter: bool) ->
 
 /// The same from masks and from strokes; a walk with switching models.
 fn beside_strokes(horse: &Creature, take: &Take, masks: &Analysis, gait: Gait) -> Result<()> {
-    let drawn = analyse(&sketch_horse(horse, take, 2.0), true)?;
+    let drawn = analyse(&sketch_horse(horse, take, 2.0), true, 0)?;
     for (name, analysis) in [("masks", masks), ("strokes", &drawn)] {
         let found = if gait == Gait::Walk { switching_models(horse, take, analysis, true) } else { one_model(horse, take, analysis, 4, 2, true) };
         let r: Vec<String> = analysis.rhythm.correlations.iter().map(|r| format!("{r:.2}")).collect();
