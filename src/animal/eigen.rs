@@ -177,7 +177,8 @@ pub(crate) mod tests {
         let singular = centred.clone().svd(false, false).singular_values;
         for k in 0..5 {
             assert!((found.eigenvalues[k] - singular[k].powi(2) / 17.0).abs() < 1e-9);
-            assert!((found.images.column(k) - general.basis.column(k)).norm() < 1e-7, "{k}");
+            // The sign may differ where several pixels are largest.
+            assert!((found.images.column(k).dot(&general.basis.column(k)).abs() - 1.0).abs() < 1e-9, "{k}");
             let series = found.series(k);
             assert!((series.iter().map(|v| v * v).sum::<f64>() / 17.0 - 1.0).abs() < 1e-9 && series.iter().sum::<f64>().abs() < 1e-9);
         }

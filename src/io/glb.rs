@@ -65,7 +65,12 @@ fn check_extents(document: &gltf::Document, blob: &[u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// Nodes with parents first, and every node's place among them.
+/// Whether a node only holds a skinned mesh, which moves with its joints: such nodes are no bones.
+fn is_holder(node: &gltf::Node) -> bool {
+    node.skin().is_some() && node.mesh().is_some() && node.children().len() == 0
+}
+
+/// Nodes with parents first, and every node's place among them; `usize::MAX` for holders of skins.
 fn bones(document: &gltf::Document) -> Option<(Vec<Bone>, Vec<usize>)> {
     let count = document.nodes().count();
     let mut parent = vec![None; count];
@@ -75,7 +80,8 @@ fn bones(document: &gltf::Document) -> Option<(Vec<Bone>, Vec<usize>)> {
         }
     }
     let (mut bones, mut place) = (Vec::new(), vec![usize::MAX; count]);
-    let mut waiting: Vec<gltf::Node> = document.nodes().filter(|n| parent[n.index()].is_none()).collect();
+    let holders = document.nodes().filter(is_holder).count();
+    let mut waiting: Vec<gltf::Node> = document.nodes().filter(|n| parent[n.index()].is_none() && !is_holder(n)).collect();
     waiting.reverse();
     while let Some(node) = waiting.pop() {
         if place[node.index()] != usize::MAX {
@@ -86,11 +92,11 @@ fn bones(document: &gltf::Document) -> Option<(Vec<Bone>, Vec<usize>)> {
         let rest = Local { translation: vector(t), rotation: quaternion(r), scale: vector(s) };
         let name = node.name().map_or_else(|| format!("node_{}", node.index()), String::from);
         bones.push(Bone { name, parent: parent[node.index()].map(|p| place[p]), rest });
-        let mut children: Vec<gltf::Node> = node.children().collect();
+        let mut children: Vec<gltf::Node> = node.children().filter(|n| !is_holder(n)).collect();
         children.reverse();
         waiting.extend(children);
     }
-    (bones.len() == count).then_some((bones, place))
+    (bones.len() + holders == count).then_some((bones, place))
 }
 
 fn vector(v: [f32; 3]) -> Vector3<f64> {
@@ -203,7 +209,8 @@ fn motion(animation: &gltf::Animation, blob: &[u8], bones: &[Bone], place: &[usi
         let interpolation = channel.sampler().interpolation();
         let each = if interpolation == Interpolation::CubicSpline { 3 } else { 1 };
         let sound = times.windows(2).all(|w| w[0] < w[1]) && times.iter().all(|t| t.is_finite());
-        if !times.is_empty() && sound && values.len() == each * times.len() {
+        let known = place[channel.target().node().index()] != usize::MAX;
+        if known && !times.is_empty() && sound && values.len() == each * times.len() {
             tracks.push((place[channel.target().node().index()], kind, Track { times, values, interpolation, turns: kind == 1 }));
         }
     }
@@ -394,8 +401,8 @@ mod tests {
         let horse = horse();
         write(&path, &horse).unwrap();
         let back = read(&path).unwrap();
-        // The mesh has its own node.
-        assert_eq!(back.bones.len(), 37);
+        // The mesh's node is no bone.
+        assert_eq!(back.bones.len(), 36);
         for bone in &horse.bones {
             let other = back.bones.iter().find(|b| b.name == bone.name).unwrap();
             let parent = |c: &Creature, b: &Bone| b.parent.map(|p| c.bones[p].name.clone());
