@@ -169,7 +169,8 @@ pub fn style(fit: &Fit, model: &NamedModel) -> Style {
     let weights = DVector::from_column_slice(&fit.state.weights);
     let hip_height = fit.shape().hip_height_m();
     let rows = 0..weights.len();
-    let covariance = rows.clone().map(|i| rows.clone().map(|j| fit.shared_covariance[(i, j)]).collect()).collect();
+    let covariance =
+        rows.clone().map(|i| rows.clone().map(|j| fit.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, j)])).collect()).collect();
     let style = Style::of_weights(&model.model, &model.hash, &weights, fit.parameter(model.model.activity), hip_height, fit.cadence_hz);
     Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }
 }

@@ -2,7 +2,8 @@
 //!
 //! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]) → root, phases, weights, shape by
 //! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart,
-//! then with more components and all points → poses, weights, shape and their uncertainty.
+//! then with more components and all points, at last with turns of single joints against the model → poses, weights, shape
+//! and their [`uncertainty`].
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
 pub mod curve;
@@ -10,11 +11,13 @@ pub mod problem;
 pub mod start;
 pub mod state;
 pub mod targets;
+pub mod uncertainty;
 pub mod weighing;
+mod wrench;
 
 use std::sync::Arc;
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::body::{Pose, Shape};
@@ -23,8 +26,9 @@ use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
 use curve::Curve;
 use problem::{Frame, Free, Known, Outside, Problem, Settings};
-use state::State;
+use state::{State, Turns};
 pub use targets::Observation;
+pub use uncertainty::Uncertainty;
 use weighing::{Fitness, fitness, total};
 
 /// Why a fit cannot begin.
@@ -49,13 +53,16 @@ pub struct FitOptions {
     pub points: usize,
     /// Silhouette rays per camera and frame.
     pub rays: usize,
+    /// Whether the person may leave the model: joints' posture and turns from frame to frame. They are kept only if they
+    /// bring the body nearer to points that the fit did not see.
+    pub deviations: bool,
 }
 
 impl Default for FitOptions {
     /// Twenty components reach 2.5 degrees against the true joints where ten reach 4 (fit on CMU walks); 500 points and
     /// 100 rays a frame cost about the same as the silhouettes' search and more change nothing.
     fn default() -> Self {
-        FitOptions { components: 20, points: 500, rays: 100 }
+        FitOptions { components: 20, points: 500, rays: 100, deviations: true }
     }
 }
 
@@ -67,10 +74,8 @@ pub struct Fit {
     /// Poses in the rig's world, one per frame.
     pub poses: Vec<Pose>,
     pub curve: Curve,
-    /// Covariance of α (first rows and columns), ln stature, length and width factors.
-    pub shared_covariance: DMatrix<f64>,
-    /// Standard deviation per frame: carrier rotation (rad, 3), position (m, 3), phase.
-    pub frame_sigmas: Vec<[f64; state::LOCAL]>,
+    /// How sure all that is; `None` where the equations are singular.
+    pub uncertainty: Option<Uncertainty>,
     pub frames: Vec<Fitness>,
     /// Robust costs of the chosen and the half-cycle-shifted hypothesis when the choice was made.
     pub hypotheses: [f64; 2],
@@ -86,22 +91,26 @@ pub struct Fit {
 /// Accelerations of a steady walk's carrier: larger values let noise through, smaller ones cut corners.
 const SETTINGS: Settings = Settings {
     model_m: 0.02,
-    point_weight: 0.08,
-    ray_weight: 0.08,
+    point_weight: 0.16,
+    ray_weight: 0.16,
     outside_weight: 0.3,
     acceleration: 1.35,
     angular_acceleration: 5.4,
     phase_acceleration: 1.35,
     tilt: 0.08,
     stature: 0.03,
-    length: 0.018,
+    length: 0.025,
     arm_length: 0.04,
-    width: 0.12,
+    width: 0.2,
+    posture: 0.04,
+    deviation: 0.1,
+    turn_acceleration: 40.0,
 };
 
 /// Steadiness of the phase while the start is still rough.
 const STEADY_PHASE: f64 = 0.3;
 
+#[derive(Clone, Copy)]
 struct Stage {
     free: Free,
     model_m: f64,
@@ -109,10 +118,11 @@ struct Stage {
     refreshes: usize,
 }
 
-const PLACED: Free = Free { rotation: false, phase: false, weights: false, stature: false, lengths: false, widths: false };
+const PLACED: Free = Free { rotation: false, phase: false, weights: false, stature: false, lengths: false, widths: false, posture: false };
 const TURNED: Free = Free { rotation: true, phase: true, ..PLACED };
 const STYLED: Free = Free { weights: true, stature: true, widths: true, ..TURNED };
 const SHAPED: Free = Free { lengths: true, ..STYLED };
+const POSED: Free = Free { posture: true, ..SHAPED };
 
 /// Everything one run needs beside the state.
 struct Run<'a> {
@@ -122,21 +132,21 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    /// Alternates frozen weights and a few solver iterations.
+    /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
     fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
         let settings = Settings { model_m: stage.model_m, phase_acceleration: stage.phase_acceleration, ..SETTINGS };
         let mut state = state;
         let mut previous = f64::INFINITY;
         for _ in 0..stage.refreshes {
             let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &state);
-            let (next, summary) = minimise(problem, state, &LmOptions { max_iterations: 6, relative_cost: 1e-4 });
-            self.iterations += summary.iterations;
-            state = next;
-            let cost = total(&fitness(curve, frames, &settings, &self.known, &state)).cost;
+            let cost = total(&problem.fitness).cost;
             if (previous - cost).abs() < 1e-3 * cost {
                 break;
             }
             previous = cost;
+            let (next, summary) = minimise(problem, state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
+            self.iterations += summary.iterations;
+            state = next;
         }
         state
     }
@@ -197,16 +207,28 @@ pub fn fit(
 
     let dense = chosen(options.points, options.rays);
     step(0.4)?;
-    let free_phase = SETTINGS.phase_acceleration;
-    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, phase_acceleration: free_phase, refreshes: 5 });
-    step(0.55)?;
-    state = run.stage(state, &dense, &ten, &Stage { free: SHAPED, model_m: 0.02, phase_acceleration: free_phase, refreshes: 6 });
-    step(0.7)?;
+    let last = Stage { free: SHAPED, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
+    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
+    step(0.5)?;
+    state = run.stage(state, &dense, &ten, &Stage { refreshes: 6, ..last });
+    step(0.6)?;
     let curve = Curve::new(model, options.components);
     state.weights.resize(curve.components(), 0.0);
-    state = run.stage(state, &dense, &curve, &Stage { free: SHAPED, model_m: 0.02, phase_acceleration: free_phase, refreshes: 10 });
+    state = run.stage(state, &dense, &curve, &last);
+    step(0.7)?;
+    let mut free = SHAPED;
+    if options.deviations {
+        let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
+        let own = run.stage(own, &dense, &curve, &Stage { free: POSED, ..last });
+        step(0.85)?;
+        let left_out: Vec<Frame> = observations.iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
+        let cost = |state: &State| total(&fitness(&curve, &left_out, &SETTINGS, &known, state)).cost;
+        if cost(&own) < cost(&state) {
+            (state, free) = (own, POSED);
+        }
+    }
     step(0.95)?;
-    Ok(finish(run, state, curve, &dense, observations, hypotheses))
+    Ok(finish(run, state, free, curve, &dense, observations, hypotheses))
 }
 
 /// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.
@@ -217,13 +239,8 @@ fn pair(found: &[start::Hypothesis]) -> Vec<&start::Hypothesis> {
     std::iter::once(best).chain(opposite).collect()
 }
 
-fn finish(run: Run, state: State, curve: Curve, frames: &[Frame], observations: &[Observation], hypotheses: [f64; 2]) -> Fit {
-    let problem = Problem::new(&curve, frames, &SETTINGS, SHAPED, &run.known, &state);
-    let size = state.layout().size();
-    let (shared_covariance, variances) = problem::uncertainty(&problem, &state).unwrap_or_else(|| {
-        (DMatrix::from_element(size, size, f64::NAN), nalgebra::DVector::from_element(state::LOCAL * frames.len(), f64::NAN))
-    });
-    let frame_sigmas = variances.as_slice().chunks_exact(state::LOCAL).map(|v| std::array::from_fn(|i| v[i].sqrt())).collect();
+fn finish(run: Run, state: State, free: Free, curve: Curve, frames: &[Frame], observations: &[Observation], hypotheses: [f64; 2]) -> Fit {
+    let uncertainty = uncertainty::uncertainty(&curve, frames, &SETTINGS, free, &run.known, &state);
     let frames = fitness(&curve, frames, &SETTINGS, &run.known, &state);
     let poses = (0..state.carriers.len()).map(|t| state.pose(&curve, t)).collect();
     let seconds = observations.last().map_or(0.0, |o| o.time_s) - observations.first().map_or(0.0, |o| o.time_s);
@@ -232,7 +249,7 @@ fn finish(run: Run, state: State, curve: Curve, frames: &[Frame], observations: 
         state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.known.up * d.dot(&run.known.up)).norm()).sum();
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
     let up = run.known.up;
-    Fit { up, poses, shared_covariance, frame_sigmas, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
+    Fit { up, poses, uncertainty, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
 }
 
 impl Fit {
@@ -254,7 +271,12 @@ impl Fit {
 
     /// Standard deviation of each weight over the population's: near 1 means that the footage said nothing about it.
     pub fn weight_uncertainty(&self) -> Vec<f64> {
-        self.curve.eigenvalues.iter().enumerate().map(|(i, lambda)| (self.shared_covariance[(i, i)] / lambda).sqrt()).collect()
+        self.curve.eigenvalues.iter().enumerate().map(|(i, lambda)| (self.shared_variance(i) / lambda).sqrt()).collect()
+    }
+
+    /// Variance of shared unknown `i` in the state's layout; NaN where it is not known.
+    pub fn shared_variance(&self, i: usize) -> f64 {
+        self.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, i)])
     }
 
     /// Root-mean-square distance of the inlying points to the skin, metres.

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::FitError;
 use super::curve::Curve;
 use super::problem::{Frame, Known, Settings};
-use super::state::{Carrier, State};
+use super::state::{Carrier, State, Turns};
 use super::targets::Observation;
 use super::weighing::{fitness, total};
 use crate::body::Shape;
@@ -187,7 +187,13 @@ fn state_of(track: &Track, frames: &[Frame], curve: &Curve, heading: &Vector3<f6
         world_from_carrier,
         phase: phase + cadence * (frame.time_s - begin),
     });
-    State { carriers: carriers.collect(), weights: vec![0.0; curve.components()], shape: Shape::template(track.stature_m) }
+    State {
+        carriers: carriers.collect(),
+        weights: vec![0.0; curve.components()],
+        shape: Shape::template(track.stature_m),
+        posture: Turns::default(),
+        deviations: Vec::new(),
+    }
 }
 
 #[cfg(test)]

@@ -2,20 +2,41 @@
 //!
 //! The paper's root vector G_t is split: a carrier that glides smoothly with the person (heading and mean speed), and the
 //! model's own root channels (tilt, list, bob, sway) riding on it, so that smoothness can be asked of the carrier alone:
-//!   world_from_root = R_t exp(ρ(μ_t, α)),  p_root = g_t + R_t H π(μ_t, α),  parent_from_joint = q̄_j exp(v_j(μ_t, α)).   (1)
+//!   world_from_root = R_t exp(ρ(μ_t, α)),  p_root = g_t + R_t H π(μ_t, α),
+//!   parent_from_joint = q̄_j exp(v_j(μ_t, α)) exp(c_j + δ_jt).                                                             (1)
+//! c_j, the posture, is what a joint keeps to all the time against the model: markers on other bodies than this one define
+//! the database's joint angles. δ_jt, the deviation, lets the person leave the model from frame to frame.
 //! Moving one unknown moves every node rigidly, x' = v + ω × x; [`Motion`] holds these twists. Unknowns in order:
-//! per frame δω, δg (left perturbation of R_t, g_t) and δμ; shared α, ln stature, limb lengths, limb widths.
+//! per frame δω, δg (left perturbation of R_t, g_t), δμ, and δ_j; shared α, ln stature, limb lengths, limb widths, c_j.
 //! Stature scales the body about g_t; lengths and widths also deform the primitives (body::surface).
 //! Checked against central differences in `problem`.
 
-use nalgebra::{DMatrix, Matrix3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 use super::curve::{Curve, CurveSample};
-use crate::body::{BALL_JOINTS, Joint, Length, NODES, Placement, Pose, PosedSurface, Shape, Surface, place};
+use crate::body::{BALL_JOINTS, Joint, Length, Placement, Pose, PosedSurface, Shape, Surface, place};
 use crate::math::rotation::{exp, left_jacobian};
 
-/// Unknowns of one frame.
+/// Unknowns of one frame without deviations.
 pub const LOCAL: usize = 7;
+
+/// Joints that may leave the model; those between follow it.
+pub const DEVIATING: [Joint; 11] = [
+    Joint::LHip,
+    Joint::LKnee,
+    Joint::LAnkle,
+    Joint::RHip,
+    Joint::RKnee,
+    Joint::RAnkle,
+    Joint::Vl1,
+    Joint::LShoulder,
+    Joint::LElbow,
+    Joint::RShoulder,
+    Joint::RElbow,
+];
+
+/// Turns of the [`DEVIATING`] joints, rad, in the joint's own frame.
+pub type Turns = [Vector3<f64>; DEVIATING.len()];
 
 /// The gliding frame of one instant, and the phase.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,15 +56,28 @@ pub struct State {
     /// α, in the units of the motion vector.
     pub weights: Vec<f64>,
     pub shape: Shape,
+    /// What the person's joints keep to all the time against the model.
+    pub posture: Turns,
+    /// Per frame, or empty: the person moves exactly as the model.
+    pub deviations: Vec<Turns>,
 }
 
-/// Where the shared unknowns stand in z.
+/// Where the unknowns stand: y of a frame, and z.
 #[derive(Clone, Copy, Debug)]
-pub struct SharedLayout {
+pub struct Layout {
+    /// Unknowns of one frame.
+    pub local: usize,
     pub weights: usize,
 }
 
-impl SharedLayout {
+/// Stature, lengths and widths, in this order.
+pub const SIZES: usize = 1 + 2 * Length::COUNT;
+
+impl Layout {
+    /// δ of deviating joint `k`, first of three, in y of a frame; only with deviations.
+    pub fn deviation(self, k: usize) -> usize {
+        LOCAL + 3 * k
+    }
     pub fn stature(self) -> usize {
         self.weights
     }
@@ -53,30 +87,17 @@ impl SharedLayout {
     pub fn width(self, limb: Length) -> usize {
         self.weights + 1 + Length::COUNT + limb as usize
     }
+    /// Posture of deviating joint `k`, first of three.
+    pub fn posture(self, k: usize) -> usize {
+        self.weights + SIZES + 3 * k
+    }
+    /// Length of z.
+    pub fn shared(self) -> usize {
+        self.weights + SIZES + 3 * DEVIATING.len()
+    }
+    /// Unknowns that move one frame.
     pub fn size(self) -> usize {
-        self.weights + 1 + 2 * Length::COUNT
-    }
-}
-
-impl State {
-    pub fn layout(&self) -> SharedLayout {
-        SharedLayout { weights: self.weights.len() }
-    }
-
-    /// The pose of one frame, equation (1).
-    pub fn pose(&self, curve: &Curve, frame: usize) -> Pose {
-        let carrier = &self.carriers[frame];
-        let sample = curve.sample(carrier.phase, &self.weights);
-        pose_of(&sample, curve, carrier, self.shape.hip_height_m())
-    }
-}
-
-fn pose_of(sample: &CurveSample, curve: &Curve, carrier: &Carrier, hip_height: f64) -> Pose {
-    let value = sample.value.as_slice();
-    Pose {
-        root: carrier.position + carrier.world_from_carrier * (CurveSample::root_position(value) * hip_height),
-        world_from_root: carrier.world_from_carrier * exp(&CurveSample::root_rotation(value)),
-        joints: std::array::from_fn(|k| curve.mean_rotations[k] * exp(&CurveSample::joint(value, k))),
+        self.local + self.shared()
     }
 }
 
@@ -89,28 +110,83 @@ pub struct Posed {
 /// The posed body and how it moves.
 pub struct Motion {
     pub surface: PosedSurface,
-    /// Per node 6 × (LOCAL + shared): velocity v of the material at the world origin, angular velocity ω.
-    pub twists: Vec<DMatrix<f64>>,
+    /// Per node six rows of [`Layout::size`] columns: velocity v of the material at the world origin, angular velocity ω.
+    pub twists: Vec<Twist>,
+}
+
+/// Six rows of `size` columns.
+#[derive(Clone, Debug)]
+pub struct Twist {
+    entries: Vec<f64>,
+    size: usize,
+}
+
+impl Twist {
+    fn zeros(size: usize) -> Twist {
+        Twist { entries: vec![0.0; 6 * size], size }
+    }
+
+    pub fn row(&self, i: usize) -> &[f64] {
+        &self.entries[i * self.size..][..self.size]
+    }
+
+    fn add_velocity(&mut self, column: usize, velocity: &Vector3<f64>) {
+        (0..3).for_each(|axis| self.entries[axis * self.size + column] += velocity[axis]);
+    }
+
+    /// Turns with `omega` about the point `at`.
+    fn add_turn(&mut self, column: usize, omega: &Vector3<f64>, at: &Vector3<f64>) {
+        self.add_velocity(column, &at.cross(omega));
+        (0..3).for_each(|axis| self.entries[(3 + axis) * self.size + column] += omega[axis]);
+    }
 }
 
 impl State {
-    pub fn posed(&self, curve: &Curve, frame: usize) -> Posed {
-        let placement = place(&self.shape.offsets(), &self.pose(curve, frame));
-        Posed { surface: PosedSurface::new(&Surface::new(&self.shape), &placement), placement }
+    pub fn layout(&self) -> Layout {
+        Layout { local: LOCAL + if self.deviations.is_empty() { 0 } else { 3 * DEVIATING.len() }, weights: self.weights.len() }
     }
 
-    /// The posed body of one frame with the twist of every node for every unknown but stature and widths.
-    pub fn motion(&self, curve: &Curve, frame: usize) -> Motion {
+    /// Posture and deviation of the joints in one frame together.
+    fn turns(&self, frame: usize) -> Turns {
+        let deviation = self.deviations.get(frame);
+        std::array::from_fn(|k| self.posture[k] + deviation.map_or(Vector3::zeros(), |d| d[k]))
+    }
+
+    /// The pose of one frame, equation (1).
+    pub fn pose(&self, curve: &Curve, frame: usize) -> Pose {
+        self.pose_of(&curve.sample(self.carriers[frame].phase, &self.weights), curve, frame)
+    }
+
+    fn pose_of(&self, sample: &CurveSample, curve: &Curve, frame: usize) -> Pose {
         let carrier = &self.carriers[frame];
-        let sample = curve.sample(carrier.phase, &self.weights);
-        let hip_height = self.shape.hip_height_m();
+        let value = sample.value.as_slice();
+        let mut joints: [UnitQuaternion<f64>; BALL_JOINTS] =
+            std::array::from_fn(|k| curve.mean_rotations[k] * exp(&CurveSample::joint(value, k)));
+        for (joint, turn) in DEVIATING.iter().zip(self.turns(frame)) {
+            joints[*joint as usize - 1] *= exp(&turn);
+        }
+        let ride = CurveSample::root_position(value) * self.shape.hip_height_m();
+        Pose {
+            root: carrier.position + carrier.world_from_carrier * ride,
+            world_from_root: carrier.world_from_carrier * exp(&CurveSample::root_rotation(value)),
+            joints,
+        }
+    }
+
+    /// The posed body of one frame; `surface` is that of the shape.
+    pub fn posed(&self, curve: &Curve, surface: &Surface, frame: usize) -> Posed {
+        let placement = place(&self.shape.offsets(), &self.pose(curve, frame));
+        Posed { surface: PosedSurface::new(surface, &placement), placement }
+    }
+
+    /// The same with the twist of every node for every unknown but stature and widths.
+    pub fn motion(&self, curve: &Curve, surface: &Surface, frame: usize) -> Motion {
+        let sample = curve.sample(self.carriers[frame].phase, &self.weights);
         let offsets = self.shape.offsets();
-        let pose = pose_of(&sample, curve, carrier, hip_height);
-        let placement = place(&offsets, &pose);
+        let placement = place(&offsets, &self.pose_of(&sample, curve, frame));
         let layout = self.layout();
-        let size = LOCAL + layout.size();
-        let mut twists = vec![DMatrix::zeros(6, size); NODES];
-        twists[0] = self.root_twist(&sample, carrier, &placement, hip_height, size);
+        let turns = self.turns(frame);
+        let mut twists = vec![self.root_twist(&sample, frame, &placement)];
         let value = sample.value.as_slice();
         for joint in Joint::ALL.into_iter().skip(1) {
             let Some(parent) = joint.parent() else { continue };
@@ -118,34 +194,43 @@ impl State {
             let mut twist = twists[p].clone();
             let at = placement.positions[k];
             let world_from_parent = placement.world_from_node[p];
-            let spin = (world_from_parent * curve.mean_rotations[k - 1]).to_rotation_matrix().into_inner()
-                * left_jacobian(&CurveSample::joint(value, k - 1));
-            add_spin(&mut twist, &sample, &spin, &at, k - 1);
+            let world_from_mean = (world_from_parent * curve.mean_rotations[k - 1]).to_rotation_matrix().into_inner();
+            let coordinates = CurveSample::joint(value, k - 1);
+            add_spin(&mut twist, layout, &sample, &(world_from_mean * left_jacobian(&coordinates)), &at, k - 1);
+            if let Some(which) = DEVIATING.iter().position(|d| *d == joint) {
+                let spin = world_from_mean * exp(&coordinates).to_rotation_matrix().into_inner() * left_jacobian(&turns[which]);
+                for (axis, omega) in spin.column_iter().map(|c| c.into_owned()).enumerate() {
+                    twist.add_turn(layout.local + layout.posture(which) + axis, &omega, &at);
+                    if layout.local > LOCAL {
+                        twist.add_turn(layout.deviation(which) + axis, &omega, &at);
+                    }
+                }
+            }
             let limb = Length::above(joint);
             let stretch = world_from_parent * offsets[k] / self.shape.lengths[limb as usize];
-            add_velocity(&mut twist, LOCAL + layout.length(limb), &stretch);
-            twists[k] = twist;
+            twist.add_velocity(layout.local + layout.length(limb), &stretch);
+            twists.push(twist);
         }
-        Motion { surface: PosedSurface::new(&Surface::new(&self.shape), &placement), twists }
+        Motion { surface: PosedSurface::new(surface, &placement), twists }
     }
 
-    fn root_twist(&self, sample: &CurveSample, carrier: &Carrier, placement: &Placement, hip_height: f64, size: usize) -> DMatrix<f64> {
-        let layout = self.layout();
-        let mut twist = DMatrix::zeros(6, size);
+    fn root_twist(&self, sample: &CurveSample, frame: usize, placement: &Placement) -> Twist {
+        let (layout, carrier, hip_height) = (self.layout(), &self.carriers[frame], self.shape.hip_height_m());
+        let mut twist = Twist::zeros(layout.size());
         let world_from_carrier = carrier.world_from_carrier.to_rotation_matrix().into_inner();
         for axis in 0..3 {
             let unit = Vector3::ith(axis, 1.0);
-            twist[(3 + axis, axis)] = 1.0;
-            add_velocity(&mut twist, axis, &carrier.position.cross(&unit));
-            add_velocity(&mut twist, 3 + axis, &unit);
+            twist.add_turn(axis, &unit, &carrier.position);
+            twist.add_velocity(3 + axis, &unit);
         }
         let value = sample.value.as_slice();
         let spin = world_from_carrier * left_jacobian(&CurveSample::root_rotation(value));
-        add_spin(&mut twist, sample, &spin, &placement.positions[0], BALL_JOINTS);
+        add_spin(&mut twist, layout, sample, &spin, &placement.positions[0], BALL_JOINTS);
         let ride = world_from_carrier * hip_height;
-        add_velocity(&mut twist, 6, &(ride * CurveSample::root_position(sample.slope.as_slice())));
+        twist.add_velocity(6, &(ride * CurveSample::root_position(sample.slope.as_slice())));
         for i in 0..layout.weights {
-            add_velocity(&mut twist, LOCAL + i, &(ride * CurveSample::root_position(sample.components.column(i).as_slice())));
+            let rate = CurveSample::root_position(sample.components.column(i).as_slice());
+            twist.add_velocity(layout.local + i, &(ride * rate));
         }
         for limb in [Length::Thigh, Length::Shank, Length::Foot] {
             let h = 1e-3;
@@ -153,7 +238,7 @@ impl State {
             longer.lengths[limb as usize] += h;
             // H is linear in each length factor, so this difference is exact.
             let growth = (longer.hip_height_m() - hip_height) / h;
-            add_velocity(&mut twist, LOCAL + layout.length(limb), &(world_from_carrier * CurveSample::root_position(value) * growth));
+            twist.add_velocity(layout.local + layout.length(limb), &(world_from_carrier * CurveSample::root_position(value) * growth));
         }
         twist
     }
@@ -162,11 +247,15 @@ impl State {
     pub fn moved(&self, y: &[f64], z: &[f64]) -> State {
         let layout = self.layout();
         let mut next = self.clone();
-        for (carrier, step) in next.carriers.iter_mut().zip(y.chunks_exact(LOCAL)) {
-            let turn = exp(&Vector3::new(step[0], step[1], step[2]));
+        let triple = |v: &[f64]| Vector3::new(v[0], v[1], v[2]);
+        for (carrier, step) in next.carriers.iter_mut().zip(y.chunks_exact(layout.local)) {
+            let turn = exp(&triple(step));
             carrier.world_from_carrier = UnitQuaternion::new_normalize((turn * carrier.world_from_carrier).into_inner());
-            carrier.position += Vector3::new(step[3], step[4], step[5]);
+            carrier.position += triple(&step[3..]);
             carrier.phase += step[6];
+        }
+        for (turns, step) in next.deviations.iter_mut().zip(y.chunks_exact(layout.local)) {
+            turns.iter_mut().enumerate().for_each(|(k, turn)| *turn += triple(&step[layout.deviation(k)..]));
         }
         for (w, dz) in next.weights.iter_mut().zip(z) {
             *w += dz;
@@ -178,27 +267,15 @@ impl State {
         for (i, factor) in next.shape.widths.iter_mut().enumerate() {
             *factor = (*factor + z[layout.weights + 1 + Length::COUNT + i]).max(0.2);
         }
+        next.posture.iter_mut().enumerate().for_each(|(k, turn)| *turn += triple(&z[layout.posture(k)..]));
         next
     }
 }
 
-fn add_velocity(twist: &mut DMatrix<f64>, column: usize, velocity: &Vector3<f64>) {
-    for axis in 0..3 {
-        twist[(axis, column)] += velocity[axis];
-    }
-}
-
 /// Adds the rotation about `at` that phase and weights give to channel triple `k`; `spin` turns coordinate rates into ω.
-fn add_spin(twist: &mut DMatrix<f64>, sample: &CurveSample, spin: &Matrix3<f64>, at: &Vector3<f64>, k: usize) {
-    let mut add = |column: usize, rate: Vector3<f64>| {
-        let omega = spin * rate;
-        add_velocity(twist, column, &at.cross(&omega));
-        for axis in 0..3 {
-            twist[(3 + axis, column)] += omega[axis];
-        }
-    };
-    add(6, CurveSample::joint(sample.slope.as_slice(), k));
+fn add_spin(twist: &mut Twist, layout: Layout, sample: &CurveSample, spin: &Matrix3<f64>, at: &Vector3<f64>, k: usize) {
+    twist.add_turn(6, &(spin * CurveSample::joint(sample.slope.as_slice(), k)), at);
     for i in 0..sample.components.ncols() {
-        add(LOCAL + i, CurveSample::joint(sample.components.column(i).as_slice(), k));
+        twist.add_turn(layout.local + i, &(spin * CurveSample::joint(sample.components.column(i).as_slice(), k)), at);
     }
 }

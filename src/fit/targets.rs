@@ -66,6 +66,14 @@ pub fn frame(
     Frame { time_s: observation.time_s, targets, outsides: outsides.clone() }
 }
 
+/// At most `points` of the cloud points that [`frame`] does not choose.
+pub fn left_out(observation: &Observation, rig: &Rig, floor_m: Option<f64>, points: usize) -> Frame {
+    let all = thinned(&observation.cloud, |x| x.dot(&rig.up.direction()) > floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M));
+    let chosen: Vec<usize> = evenly(&(0..all.len()).collect::<Vec<_>>(), points);
+    let others: Vec<Target> = (0..all.len()).filter(|i| chosen.binary_search(i).is_err()).map(|i| all[i].clone()).collect();
+    Frame { time_s: observation.time_s, targets: evenly(&others, points), outsides: Arc::default() }
+}
+
 fn evenly<T: Clone>(items: &[T], wanted: usize) -> Vec<T> {
     if items.len() <= wanted {
         return items.to_vec();

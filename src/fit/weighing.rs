@@ -9,17 +9,28 @@ use rayon::prelude::*;
 use super::curve::Curve;
 use super::problem::{Frame, Known, Outside, Settings, Target};
 use super::state::State;
-use crate::body::PosedSurface;
-use crate::body::surface::Evaluation;
+use crate::body::surface::{Evaluation, Near};
+use crate::body::{PosedSurface, Surface};
 
 /// Frozen quantities of one target.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Frozen {
     pub x: Vector3<f64>,
+    /// The primitives that count.
+    pub near: Near,
     /// ω_i.
     pub weight: f64,
     /// κ_i.
     pub metres_per_root: f64,
+    /// Signed distance, the standard deviation that it is believed to have, and the target's own variance in it, m and m².
+    pub distance_m: f64,
+    pub sigma_m: f64,
+    pub variance: f64,
+    /// Cauchy weight, 0 to 1.
+    pub robust: f64,
+    /// Node that the skin there belongs to.
+    pub node: u8,
+    pub is_point: bool,
 }
 
 /// Frozen quantities of one primitive in one silhouette's picture.
@@ -75,7 +86,8 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
             Target::Point { x, .. } => (*x, settings.point_weight),
             Target::Ray { origin, direction, .. } => (closest_on_ray(surface, origin, direction, &mut evaluation), settings.ray_weight),
         };
-        surface.evaluate_into(&x, &mut evaluation);
+        let near = surface.near(&x, &mut evaluation);
+        surface.evaluate_among(&near, &x, &mut evaluation);
         let normal = evaluation.gradient.normalize();
         let (variance, hidden) = match target {
             Target::Point { covariance, .. } => {
@@ -94,7 +106,19 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
             fitness.inliers += 1;
             fitness.inlier_square += distance * distance;
         }
-        Frozen { x, weight: base * robust * precision, metres_per_root: evaluation.metres_per_root() }
+        let nearest = evaluation.shares.iter().min_by(|a, b| a.unit.norm_squared().total_cmp(&b.unit.norm_squared()));
+        Frozen {
+            x,
+            near,
+            weight: base * robust * precision,
+            metres_per_root: evaluation.metres_per_root(),
+            distance_m: evaluation.distance(),
+            sigma_m: precision.sqrt().recip(),
+            variance,
+            robust,
+            node: nearest.map_or(0, |share| surface.primitives[share.primitive].node as u8),
+            is_point: matches!(target, Target::Point { .. }),
+        }
     });
     (frozen.collect(), fitness)
 }
@@ -122,8 +146,9 @@ fn near_floor(known: &Known, x: &Vector3<f64>) -> bool {
 
 /// Robust fitness of each frame at a state.
 pub fn fitness(curve: &Curve, frames: &[Frame], settings: &Settings, known: &Known, state: &State) -> Vec<Fitness> {
+    let body = Surface::new(&state.shape);
     let of_frame = |t: usize| {
-        let surface = state.posed(curve, t).surface;
+        let surface = state.posed(curve, &body, t).surface;
         let points = freeze(&frames[t], &surface, settings, known).1;
         Fitness { cost: points.cost + freeze_outsides(&frames[t], &surface, settings).1, ..points }
     };
@@ -137,21 +162,12 @@ pub fn total(fitness: &[Fitness]) -> Fitness {
 
 /// The point of a ray nearest to the skin: least d_eff among the closest approaches to the primitives, then refined.
 fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
-    let mut approaches: Vec<(f64, f64)> = surface
-        .primitives
-        .iter()
-        .map(|p| {
-            let (o, d) = (p.unit_from_world * (origin - p.centre), p.unit_from_world * direction);
-            let along = -o.dot(&d) / d.norm_squared();
-            ((o + d * along).norm_squared(), along)
-        })
-        .collect();
-    approaches.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let (near, places) = surface.near_line(origin, direction, CANDIDATES, evaluation);
     let mut best = (f64::INFINITY, 0.0);
-    for (_, along) in approaches.iter().take(CANDIDATES) {
-        surface.evaluate_into(&(origin + direction * *along), evaluation);
+    for along in places {
+        surface.evaluate_among(&near, &(origin + direction * along), evaluation);
         if evaluation.d_eff < best.0 {
-            best = (evaluation.d_eff, *along);
+            best = (evaluation.d_eff, along);
         }
     }
     // Near one primitive d_eff is a parabola along the ray; three secant steps on its slope settle the blend.
@@ -159,7 +175,7 @@ fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vec
     for _ in 0..3 {
         let h = 2e-3;
         let mut slope = |s: f64| {
-            surface.evaluate_into(&(origin + direction * s), evaluation);
+            surface.evaluate_among(&near, &(origin + direction * s), evaluation);
             evaluation.gradient.dot(direction)
         };
         let (before, after) = (slope(along - h), slope(along + h));
@@ -183,7 +199,7 @@ mod tests {
         let model = made_up_model(3);
         let curve = Curve::new(&model, 3);
         let state = state();
-        let surface = state.posed(&curve, 0).surface;
+        let surface = state.posed(&curve, &Surface::new(&state.shape), 0).surface;
         for target in &frames(&curve, &state)[0].targets {
             if let Target::Ray { origin, direction, .. } = target {
                 let found = closest_on_ray(&surface, origin, direction, &mut Evaluation::default());

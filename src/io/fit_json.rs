@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::write_atomic;
 use crate::body::Length;
-use crate::fit::{Fit, Observation, weighing::total};
+use crate::fit::{Fit, Observation, state::LOCAL, weighing::total};
 
 /// Fewer inlying points than this leave a frame to its neighbours.
 const FEW_POINTS: usize = 40;
@@ -58,7 +58,7 @@ struct FrameReport {
 pub fn write(path: &Path, fit: &Fit, observations: &[Observation], model: &str, model_hash: &str) -> std::io::Result<()> {
     let sum = total(&fit.frames);
     let layout = fit.state.layout();
-    let sigma = |i: usize| fit.shared_covariance[(i, i)].sqrt();
+    let sigma = |i: usize| fit.shared_variance(i).sqrt();
     let limbs = |values: &[f64], index: &dyn Fn(Length) -> usize| {
         Length::ALL.iter().map(|l| (format!("{l:?}").to_lowercase(), [values[*l as usize], sigma(index(*l))])).collect()
     };
@@ -91,7 +91,8 @@ pub fn write(path: &Path, fit: &Fit, observations: &[Observation], model: &str, 
 }
 
 fn frame_report(fit: &Fit, observation: &Observation, t: usize) -> FrameReport {
-    let (fitness, sigmas) = (&fit.frames[t], &fit.frame_sigmas[t]);
+    let fitness = &fit.frames[t];
+    let sigmas = fit.uncertainty.as_ref().map_or([f64::NAN; LOCAL], |u| u.frames[t].local);
     let status = match (observation.cloud.points.len(), fitness.inliers) {
         (0, _) => "no cloud, from its neighbours",
         (_, n) if n < FEW_POINTS => "few points, mostly from its neighbours",

@@ -57,11 +57,9 @@ impl BandMatrix {
             let first = row.saturating_sub(self.bandwidth);
             for column in first..=row {
                 let from = first.max(column.saturating_sub(self.bandwidth));
-                let mut sum = l.rows[l.index(row, column)];
-                for k in from..column {
-                    sum -= l.rows[l.index(row, k)] * l.rows[l.index(column, k)];
-                }
                 let index = l.index(row, column);
+                let (of_row, of_column) = (l.index(row, from), l.index(column, from));
+                let sum = l.rows[index] - dot(&l.rows[of_row..index], &l.rows[of_column..][..column - from]);
                 if row == column {
                     if sum.is_nan() || sum <= 0.0 {
                         return None;
@@ -77,6 +75,24 @@ impl BandMatrix {
 }
 
 impl BandCholesky {
+    /// The entries of (L Lᵀ)⁻¹ within the band, O(n·bandwidth²) (Takahashi, Fagan and Chin 1973):
+    ///   Z_ij = (δ_ij/L_jj − Σ_{k>j} L_kj Z_ki) / L_jj for i ≥ j, from the last column to the first.
+    pub fn selected_inverse(&self) -> BandMatrix {
+        let l = &self.0;
+        let mut z = BandMatrix::zeros(l.size, l.bandwidth);
+        for j in (0..l.size).rev() {
+            let last = (j + l.bandwidth).min(l.size - 1);
+            let column: Vec<f64> = (j..=last).map(|k| l.rows[l.index(k, j)]).collect();
+            for i in (j..=last).rev() {
+                let known: f64 = (j + 1..=last).map(|k| column[k - j] * z.get(k, i)).sum();
+                let unit = if i == j { 1.0 / column[0] } else { 0.0 };
+                let at = z.index(i, j);
+                z.rows[at] = (unit - known) / column[0];
+            }
+        }
+        z
+    }
+
     /// X with L Lᵀ X = `right`.
     pub fn solve(&self, right: &DMatrix<f64>) -> DMatrix<f64> {
         let l = &self.0;
@@ -95,6 +111,17 @@ impl BandCholesky {
         }
         x
     }
+}
+
+/// Sum of products, four at a time.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let (quads_a, quads_b) = (a.chunks_exact(4), b.chunks_exact(4));
+    let rest: f64 = quads_a.remainder().iter().zip(quads_b.remainder()).map(|(x, y)| x * y).sum();
+    let mut sums = [0.0; 4];
+    for (x, y) in quads_a.zip(quads_b) {
+        (0..4).for_each(|i| sums[i] += x[i] * y[i]);
+    }
+    sums.iter().sum::<f64>() + rest
 }
 
 #[cfg(test)]
@@ -117,6 +144,11 @@ mod tests {
         let right = DMatrix::from_fn(n, 3, |i, j| ((i + 11 * j) as f64).cos());
         let expected = dense.cholesky().unwrap().solve(&right);
         assert!((band.cholesky().unwrap().solve(&right) - expected).amax() < 1e-12);
+        let inverse = band.cholesky().unwrap().selected_inverse();
+        let dense_inverse = band.cholesky().unwrap().solve(&DMatrix::identity(n, n));
+        for i in 0..n {
+            (i.saturating_sub(bandwidth)..=i).for_each(|j| assert!((inverse.get(i, j) - dense_inverse[(i, j)]).abs() < 1e-13));
+        }
         let mut isolated = band.clone();
         isolated.isolate(7);
         assert!((isolated.cholesky().unwrap().solve(&right).row(7) - right.row(7)).amax() < 1e-12);
