@@ -44,7 +44,13 @@ fn film(folder: &Path, gait: Gait, frames: usize) -> (Vec<GrayImage>, Vec<Postur
     let mut random = ChaCha8Rng::seed_from_u64(3);
     // Blotches of grass and sky, wider than the clip's way.
     let ground: Vec<f64> = (0..1200 * 180).map(|_| random.random::<f64>()).collect();
-    let blotch = |x: usize, y: usize| (0..3).flat_map(|dy| (0..3).map(move |dx| (dx, dy))).map(|(dx, dy)| ground[(y / 4 * 4 + dy) % 180 * 1200 + (x / 4 * 4 + dx) % 1200]).sum::<f64>() / 9.0;
+    let blotch = |x: usize, y: usize| {
+        (0..3)
+            .flat_map(|dy| (0..3).map(move |dx| (dx, dy)))
+            .map(|(dx, dy)| ground[(y / 4 * 4 + dy) % 180 * 1200 + (x / 4 * 4 + dx) % 1200])
+            .sum::<f64>()
+            / 9.0
+    };
     let (mut masks, mut postures) = (Vec::new(), Vec::new());
     for t in 0..frames {
         let posture = motion.at((t as f64 / 25.0).rem_euclid(motion.duration_s())).unwrap();
@@ -103,7 +109,11 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut open = vec![folder.to_path_buf()];
     while let Some(at) = open.pop() {
         for entry in at.read_dir().unwrap().map(|e| e.unwrap().path()) {
-            if entry.is_dir() { open.push(entry) } else { found.insert(entry.strip_prefix(folder).unwrap().to_path_buf(), std::fs::read(&entry).unwrap()); }
+            if entry.is_dir() {
+                open.push(entry)
+            } else {
+                found.insert(entry.strip_prefix(folder).unwrap().to_path_buf(), std::fs::read(&entry).unwrap());
+            }
         }
     }
     found
@@ -131,7 +141,12 @@ fn a_canter_goes_from_rectangles_to_an_animation_near_the_truth_with_any_number_
     }
     let (one, four) = (files(&dir.path().join("masks1")), files(&dir.path().join("masks4")));
     assert!(one == four && one.keys().filter(|k| k.extension().is_some_and(|e| e == "png")).count() == 64);
-    let mean = truth.iter().enumerate().map(|(t, m)| iou(m, &image::open(dir.path().join(format!("masks1/{t:06}.png"))).unwrap().into_luma8())).sum::<f64>() / 64.0;
+    let mean = truth
+        .iter()
+        .enumerate()
+        .map(|(t, m)| iou(m, &image::open(dir.path().join(format!("masks1/{t:06}.png"))).unwrap().into_luma8()))
+        .sum::<f64>()
+        / 64.0;
     println!("masks: IoU {mean:.3}");
     assert!(mean > 0.88, "{mean}");
 
@@ -162,7 +177,21 @@ fn a_canter_goes_from_rectangles_to_an_animation_near_the_truth_with_any_number_
     let sums: Vec<f64> = csv.lines().skip(1).map(|l| l.rsplit(',').next().unwrap().parse().unwrap()).collect();
     assert!(sums.len() == 64 && sums.iter().all(|s| (s - 1.0).abs() < 0.5));
     // Another take of the same species needs no new poses.
-    fine(&["animal", "transfer", &at("analysis"), &at("keys"), &at("masks4"), "--poses", &at("poses.glb"), "--fps", "25", "--travel", "feet", "-o", &at("again")]);
+    fine(&[
+        "animal",
+        "transfer",
+        &at("analysis"),
+        &at("keys"),
+        &at("masks4"),
+        "--poses",
+        &at("poses.glb"),
+        "--fps",
+        "25",
+        "--travel",
+        "feet",
+        "-o",
+        &at("again"),
+    ]);
     let again = glb::read(&dir.path().join("again/motion.glb")).unwrap();
     let found: Vec<Posture> = again.motions[0].postures.iter().map(|p| horse.posture_from(&again, p).unwrap()).collect();
     assert!(angle_error(&horse, &postures, &found).mean_deg < 5.0);
@@ -259,7 +288,10 @@ fn bad_clips_end_with_one_sentence() {
     assert!(outside.contains("230,0,50,20 on frame 0 is not inside the 240x180 picture"), "{outside}");
     let late = refused(&["animal", "masks", &at("clip"), "--subject", "40:100,80,20,20", "--background", "0,0,20,20", "-o", &at("m")]);
     assert!(late.contains("frame 40") && late.contains("last frame is 11"), "{late}");
-    assert!(refused(&["animal", "masks", &at("nothing"), "--subject", "1,1,5,5", "--background", "0,0,20,20", "-o", &at("m")]).contains("nothing"));
+    assert!(
+        refused(&["animal", "masks", &at("nothing"), "--subject", "1,1,5,5", "--background", "0,0,20,20", "-o", &at("m")])
+            .contains("nothing")
+    );
     assert!(!dir.path().join("m").exists());
     let occupied = dir.path().join("thesis");
     std::fs::create_dir(&occupied).unwrap();
@@ -286,7 +318,11 @@ fn bad_clips_end_with_one_sentence() {
             let [a, b, c]: [f64; 3] = std::array::from_fn(|_| random.random::<f64>());
             GrayImage::from_fn(90, 70, |x, y| {
                 let (x, y) = (f64::from(x) - 45.0, f64::from(y) - 35.0);
-                image::Luma([if (x / (12.0 + 12.0 * a)).powi(2) + (y / (10.0 + 9.0 * b)).powi(2) + 0.001 * c * x * y < 1.0 { 255 } else { 0 }])
+                image::Luma([if (x / (12.0 + 12.0 * a)).powi(2) + (y / (10.0 + 9.0 * b)).powi(2) + 0.001 * c * x * y < 1.0 {
+                    255
+                } else {
+                    0
+                }])
             })
         })
         .collect();

@@ -22,7 +22,8 @@ impl Drop for Own {
 
 /// Starts a program and waits for the first line of its output that holds `mark`.
 fn started(command: &mut Command, mark: &str) -> (Own, String) {
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("the program starts; .ci/install installs browsers");
+    let mut child =
+        command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("the program starts; .ci/install installs browsers");
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let line = lines.by_ref().map(Result::unwrap).find(|l| l.contains(mark)).expect("the program says that it is ready");
     // What follows must not fill the pipe.
@@ -73,7 +74,8 @@ struct Browser {
 impl Browser {
     fn call(&self, method: &str, path: &str, body: Value) -> Value {
         let body = if method == "GET" { String::new() } else { body.to_string() };
-        let (status, text) = http(self.port, method, &format!("/session/{}{path}", self.session), &format!("127.0.0.1:{}", self.port), &body);
+        let (status, text) =
+            http(self.port, method, &format!("/session/{}{path}", self.session), &format!("127.0.0.1:{}", self.port), &body);
         let value: Value = serde_json::from_str(&text).unwrap();
         assert_eq!(status, 200, "{path}: {text}");
         value["value"].clone()
@@ -129,8 +131,10 @@ fn drawings_are_saved_copied_undone_and_kept() {
     let dir = tempfile::tempdir().unwrap();
     clip(&dir.path().join("clip"));
     let out = dir.path().join("drawn");
-    let (_page, line) =
-        started(Command::new(env!("CARGO_BIN_EXE_muybridge")).args(["animal", "sketch"]).arg(dir.path().join("clip")).arg("-o").arg(&out), "http://127.0.0.1:");
+    let (_page, line) = started(
+        Command::new(env!("CARGO_BIN_EXE_muybridge")).args(["animal", "sketch"]).arg(dir.path().join("clip")).arg("-o").arg(&out),
+        "http://127.0.0.1:",
+    );
     let address = line.split_whitespace().find(|w| w.starts_with("http://")).unwrap().to_string();
     let port: u16 = address.trim_end_matches('/').rsplit(':').next().unwrap().parse().unwrap();
 
@@ -145,8 +149,16 @@ fn drawings_are_saved_copied_undone_and_kept() {
     let driver: u16 = line.rsplit_once("port ").unwrap().1.trim_end_matches('.').trim().parse().unwrap();
     let profile = dir.path().join("profile");
     let arguments = [
-        "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
-        "--disable-sync", "--window-size=1200,900", &format!("--user-data-dir={}", profile.display()),
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--window-size=1200,900",
+        &format!("--user-data-dir={}", profile.display()),
     ];
     let wanted = json!({ "capabilities": { "alwaysMatch": { "goog:chromeOptions": { "args": arguments } } } });
     let (status, text) = http(driver, "POST", "/session", &format!("127.0.0.1:{driver}"), &wanted.to_string());
@@ -173,7 +185,9 @@ fn drawings_are_saved_copied_undone_and_kept() {
     // The next frame shows it through and copies it; undo takes one back.
     browser.click("#next");
     browser.wait("document.getElementById('stage').dataset.frame === '1'");
-    let tint = |x: u32, y: u32| browser.script(&format!("return Array.from(document.getElementById('stage').getContext('2d').getImageData({x}, {y}, 1, 1).data);"));
+    let tint = |x: u32, y: u32| {
+        browser.script(&format!("return Array.from(document.getElementById('stage').getContext('2d').getImageData({x}, {y}, 1, 1).data);"))
+    };
     assert!(tint(70, 38) != tint(70, 80), "onion skin");
     browser.click("#onion");
     assert_eq!(tint(70, 38), tint(70, 80));

@@ -114,7 +114,10 @@ mod tests {
             assert!(away < 0.35, "{t}: {away}");
         }
         let unturned = fitted_windows(&mirrored, &known.windows, false).unwrap();
-        let away = |w: &GrayImage, t: usize| { let p = known.eigen.project(w); (0..2).map(|k| (p[k] - known.eigen.coefficients[(t, k)]).powi(2)).sum::<f64>() };
+        let away = |w: &GrayImage, t: usize| {
+            let p = known.eigen.project(w);
+            (0..2).map(|k| (p[k] - known.eigen.coefficients[(t, k)]).powi(2)).sum::<f64>()
+        };
         assert!((0..40).map(|t| away(&unturned[t], t)).sum::<f64>() > 4.0 * (0..40).map(|t| away(&fitted[t], t)).sum::<f64>());
     }
 }

@@ -28,7 +28,8 @@ impl PoseSpace {
             Local { translation, rotation: mean(&rotations).unwrap_or_default(), scale: first[bone].scale }
         };
         let mean: Posture = (0..first.len()).map(centre).collect();
-        let offset = |(local, mean): (&Local, &Local)| (log(&(mean.rotation.inverse() * local.rotation)), local.translation - mean.translation);
+        let offset =
+            |(local, mean): (&Local, &Local)| (log(&(mean.rotation.inverse() * local.rotation)), local.translation - mean.translation);
         let offsets = poses.iter().map(|p| p.iter().zip(&mean).map(offset).collect()).collect();
         Some(PoseSpace { mean, offsets })
     }

@@ -144,7 +144,19 @@ fn homography(from: &Prepared, to: &Mat, guess: &Matrix3<f64>) -> opencv::Result
     let levels = if *guess == Matrix3::identity() { 3 } else { 1 };
     let stop = TermCriteria::new(3, 30, 0.01)?;
     let flags = video::OPTFLOW_USE_INITIAL_FLOW;
-    video::calc_optical_flow_pyr_lk(&from.1, to, &from.2, &mut tracked, &mut status, &mut error, Size::new(17, 17), levels, stop, flags, 1e-4)?;
+    video::calc_optical_flow_pyr_lk(
+        &from.1,
+        to,
+        &from.2,
+        &mut tracked,
+        &mut status,
+        &mut error,
+        Size::new(17, 17),
+        levels,
+        stop,
+        flags,
+        1e-4,
+    )?;
     let found: Vec<_> = from.2.iter().zip(&tracked).zip(&status).filter(|(_, s)| *s > 0).map(|(pair, _)| pair).collect();
     let (a, b): (Vector<Point2f>, Vector<Point2f>) = (found.iter().map(|p| p.0).collect(), found.iter().map(|p| p.1).collect());
     if a.len() < FEWEST {
@@ -225,7 +237,11 @@ mod tests {
         for (i, c) in change.iter().enumerate().filter(|(_, c)| !c.is_nan()) {
             let (x, y) = ((i % 160) as f64, (i / 160) as f64);
             let r = (x + 20.0 - 40.0 - 32.0).hypot(y - 60.0);
-            if r < 12.0 { mover.push(*c) } else if r > 17.0 { rest.push(*c) }
+            if r < 12.0 {
+                mover.push(*c)
+            } else if r > 17.0 {
+                rest.push(*c)
+            }
         }
         let share = |v: &[f32]| v.iter().filter(|c| **c > 8.0).count() as f64 / v.len() as f64;
         assert!(share(&mover) > 0.9 && share(&rest) < 0.08, "{} {}", share(&mover), share(&rest));

@@ -119,9 +119,8 @@ impl Creature {
             self.world_from_bones(posture).iter().zip(&self.skin.bone_from_mesh).map(|(w, b)| w * b).collect();
         let place = |v: &Vertex| {
             let parts = v.bones.iter().zip(&v.weights).filter(|(_, w)| **w > 0.0);
-            let sum: Vector3<f64> = parts
-                .filter_map(|(b, w)| Some((world_from_mesh.get(usize::from(*b))? * v.position.push(1.0)).xyz() * f64::from(*w)))
-                .sum();
+            let sum: Vector3<f64> =
+                parts.filter_map(|(b, w)| Some((world_from_mesh.get(usize::from(*b))? * v.position.push(1.0)).xyz() * f64::from(*w))).sum();
             sum
         };
         self.skin.vertices.iter().map(place).collect()
@@ -172,12 +171,24 @@ impl Creature {
         for (child, bone) in self.bones.iter().enumerate() {
             let Some(parent) = bone.parent else { continue };
             let along = places[child] - places[parent];
-            let Some(across) = along.cross(&if along.x.abs() > 0.9 * along.norm() { Vector3::y() } else { Vector3::x() }).try_normalize(1e-9) else { continue };
+            let Some(across) =
+                along.cross(&if along.x.abs() > 0.9 * along.norm() { Vector3::y() } else { Vector3::x() }).try_normalize(1e-9)
+            else {
+                continue;
+            };
             let third = along.normalize().cross(&across);
             let (waist, thick) = (places[parent] + along * 0.15, 0.08 * along.norm());
-            let corners = [places[parent], waist + across * thick, waist + third * thick, waist - across * thick, waist - third * thick, places[child]];
+            let corners = [
+                places[parent],
+                waist + across * thick,
+                waist + third * thick,
+                waist - across * thick,
+                waist - third * thick,
+                places[child],
+            ];
             let first = self.skin.vertices.len() as u32;
-            let vertex = |position| Vertex { position, bones: [parent as u16, 0, 0, 0], weights: [1.0, 0.0, 0.0, 0.0], colour: [190, 190, 200] };
+            let vertex =
+                |position| Vertex { position, bones: [parent as u16, 0, 0, 0], weights: [1.0, 0.0, 0.0, 0.0], colour: [190, 190, 200] };
             self.skin.vertices.extend(corners.map(vertex));
             for k in 0..4 {
                 let (a, b) = (first + 1 + k, first + 1 + (k + 1) % 4);
@@ -218,7 +229,9 @@ impl Creature {
             let turned = theirs[o] * their_rest[o].inverse() * rest[k];
             let parent = bone.parent.map_or(UnitQuaternion::identity(), |p| now[p]);
             now.push(turned);
-            let basis = |world: &[Matrix4<f64>], parent: Option<usize>| parent.map_or(nalgebra::Matrix3::identity(), |p| world[p].fixed_view::<3, 3>(0, 0).into_owned());
+            let basis = |world: &[Matrix4<f64>], parent: Option<usize>| {
+                parent.map_or(nalgebra::Matrix3::identity(), |p| world[p].fixed_view::<3, 3>(0, 0).into_owned())
+            };
             let shift = basis(&their_world, other.bones[o].parent) * (posture[o].translation - other.bones[o].rest.translation) * ratio;
             let own = basis(&world, bone.parent).try_inverse().map_or(shift, |inverse| inverse * shift);
             result.push(Local { translation: bone.rest.translation + own, rotation: parent.inverse() * turned, scale: bone.rest.scale });
@@ -247,7 +260,8 @@ mod tests {
         let bones = vec![bone(None, 1.0), bone(Some(0), 1.0)];
         let mut creature = Creature { bones, skin: Skin::default(), motions: Vec::new() };
         let at_rest = creature.world_from_bones(&creature.rest());
-        creature.skin = Skin { vertices: vec![vertex], triangles: vec![], bone_from_mesh: at_rest.iter().map(|m| m.try_inverse().unwrap()).collect() };
+        creature.skin =
+            Skin { vertices: vec![vertex], triangles: vec![], bone_from_mesh: at_rest.iter().map(|m| m.try_inverse().unwrap()).collect() };
         assert!((creature.vertices(&creature.rest())[0] - vertex.position).norm() < 1e-12);
         let mut posture = creature.rest();
         posture[1].rotation = exp(&Vector3::new(0.5, 0.0, 0.0));
@@ -260,7 +274,9 @@ mod tests {
         assert!(creature.angles_about(&Vector3::y(), &posture)[1].abs() < 1e-12);
         let motion = Motion::at_rate("turn", 2.0, vec![creature.rest(), posture]);
         let half = motion.at(0.25).unwrap();
-        assert!((log(&half[1].rotation).x - 0.25).abs() < 1e-12 && motion.at(9.0).unwrap() == motion.postures[1] && motion.duration_s() == 0.5);
+        assert!(
+            (log(&half[1].rotation).x - 0.25).abs() < 1e-12 && motion.at(9.0).unwrap() == motion.postures[1] && motion.duration_s() == 0.5
+        );
     }
 
     #[test]

@@ -126,7 +126,10 @@ impl Eigenimages {
 
     /// p of another mask of the same size, (1).
     pub fn project(&self, mask: &GrayImage) -> Vec<f64> {
-        let centred = DVector::from_iterator(self.mean.len(), mask.as_raw().iter().zip(self.mean.iter()).map(|(&p, m)| f64::from(u8::from(p > 127)) - m));
+        let centred = DVector::from_iterator(
+            self.mean.len(),
+            mask.as_raw().iter().zip(self.mean.iter()).map(|(&p, m)| f64::from(u8::from(p > 127)) - m),
+        );
         (0..self.images.ncols()).map(|k| self.images.column(k).dot(&centred) / self.eigenvalues[k].sqrt()).collect()
     }
 
@@ -203,7 +206,9 @@ pub(crate) mod tests {
         let general = crate::math::pca::pca(&pixels.transpose());
         let plain = eigenimages(&masks, 3, 0).unwrap();
         for k in 0..3 {
-            assert!((found.eigenvalues[k] - general.eigenvalues[k]).abs() < 1e-7 && (found.eigenvalues[k] - plain.eigenvalues[k]).abs() > 1e-3);
+            assert!(
+                (found.eigenvalues[k] - general.eigenvalues[k]).abs() < 1e-7 && (found.eigenvalues[k] - plain.eigenvalues[k]).abs() > 1e-3
+            );
             assert!((found.images.column(k).dot(&general.basis.column(k)).abs() - 1.0).abs() < 1e-6, "{k}");
         }
     }

@@ -180,7 +180,8 @@ fn add_ellipsoid(skin: &mut Skin, bone: u16, centre: Vector3<f64>, direction: Ve
     let first = skin.vertices.len() as u32;
     for j in 0..=ALONG {
         for i in 0..AROUND {
-            let (latitude, longitude) = (std::f64::consts::PI * f64::from(j) / f64::from(ALONG), std::f64::consts::TAU * f64::from(i) / f64::from(AROUND));
+            let (latitude, longitude) =
+                (std::f64::consts::PI * f64::from(j) / f64::from(ALONG), std::f64::consts::TAU * f64::from(i) / f64::from(AROUND));
             let unit = Vector3::new(latitude.sin() * longitude.cos(), latitude.sin() * longitude.sin(), latitude.cos());
             let position = centre + world_from_axes * unit.component_mul(&radii);
             skin.vertices.push(Vertex { position, bones: [bone, 0, 0, 0], weights: [1.0, 0.0, 0.0, 0.0], colour });
@@ -311,7 +312,10 @@ mod tests {
             for (bone, angle) in horse.bones.iter().zip(angles) {
                 assert!((angle.to_degrees() - angle_deg(gait, &bone.name, 0.3)).abs() < 1e-9, "{}", bone.name);
             }
-            assert!(posture(&horse, gait, 0.1) != now && posture(&horse, gait, 1.3).iter().zip(&now).all(|(a, b)| a.rotation.angle_to(&b.rotation) < 1e-9));
+            assert!(
+                posture(&horse, gait, 0.1) != now
+                    && posture(&horse, gait, 1.3).iter().zip(&now).all(|(a, b)| a.rotation.angle_to(&b.rotation) < 1e-9)
+            );
         }
     }
 

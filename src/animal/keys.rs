@@ -68,10 +68,13 @@ fn select_within(points: &[Vec<f64>], keys: usize, most: usize) -> Result<Select
     let bound = match (exact, keys) {
         (true, _) => condition,
         (false, 2) => 1.0,
-        (false, _) => (2..=4.min(keys - 1)).rev().find_map(|fewer| {
-            let found = select_within(points, fewer, most).ok()?;
-            found.exact.then_some(found.condition)
-        }).unwrap_or(1.0),
+        (false, _) => (2..=4.min(keys - 1))
+            .rev()
+            .find_map(|fewer| {
+                let found = select_within(points, fewer, most).ok()?;
+                found.exact.then_some(found.condition)
+            })
+            .unwrap_or(1.0),
     };
     Ok(Selection { frames, condition, exact, bound, evaluations })
 }
@@ -231,7 +234,14 @@ mod tests {
         if m == 0 {
             return vec![Vec::new()];
         }
-        (m - 1..n).flat_map(|last| all_subsets(last, m - 1).into_iter().map(move |mut s| { s.push(last); s })).collect()
+        (m - 1..n)
+            .flat_map(|last| {
+                all_subsets(last, m - 1).into_iter().map(move |mut s| {
+                    s.push(last);
+                    s
+                })
+            })
+            .collect()
     }
 
     #[test]

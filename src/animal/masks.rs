@@ -21,8 +21,8 @@ use rayon::prelude::*;
 use super::change::{Scenery, lab};
 use super::mixture::Mixture;
 use super::region::{Region, follow};
-use crate::math::order::quantile;
 use crate::footage::regions::{area_px, box_vote, dilate, erode, fill_holes, open};
+use crate::math::order::quantile;
 
 /// Longer side of the pictures that are worked on.
 const WORKING_PX: u32 = 448;
@@ -99,14 +99,23 @@ pub struct Silhouettes {
 }
 
 /// Finds the animal in every frame. `goes_on` is asked after each frame.
-pub fn silhouettes(frames: &[RgbImage], marks: &[Mark], options: &MaskOptions, goes_on: &mut dyn FnMut() -> bool) -> Result<Silhouettes, MaskError> {
+pub fn silhouettes(
+    frames: &[RgbImage],
+    marks: &[Mark],
+    options: &MaskOptions,
+    goes_on: &mut dyn FnMut() -> bool,
+) -> Result<Silhouettes, MaskError> {
     check(frames, marks)?;
     let (width, height) = frames[0].dimensions();
     let scale = (f64::from(WORKING_PX) / f64::from(width.max(height))).min(1.0);
     let small = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
-    let working: Vec<RgbImage> =
-        if scale < 1.0 { frames.par_iter().map(|f| shrink(f, small(width), small(height))).collect::<opencv::Result<_>>()? } else { frames.to_vec() };
-    let marks: Vec<Mark> = marks.iter().map(|m| Mark { rectangle: scaled(m.rectangle, scale, small(width), small(height)), ..*m }).collect();
+    let working: Vec<RgbImage> = if scale < 1.0 {
+        frames.par_iter().map(|f| shrink(f, small(width), small(height))).collect::<opencv::Result<_>>()?
+    } else {
+        frames.to_vec()
+    };
+    let marks: Vec<Mark> =
+        marks.iter().map(|m| Mark { rectangle: scaled(m.rectangle, scale, small(width), small(height)), ..*m }).collect();
     let scenery = Scenery::new(&working)?;
     let mut run = Run::new(&working, &marks, options, &scenery)?;
     let anchor = marks.iter().filter(|m| m.subject).map(|m| m.frame).min().unwrap_or(0);
@@ -135,7 +144,8 @@ pub fn silhouettes(frames: &[RgbImage], marks: &[Mark], options: &MaskOptions, g
             for (f, found) in done {
                 soft[f] = Vec::new();
                 if let Some((mask, region)) = found {
-                    (masks[f], regions[f]) = (mask, Some(Region { second_px: run.seconds[f].map(|s| (s as f64 / (scale * scale)) as usize), ..region }));
+                    (masks[f], regions[f]) =
+                        (mask, Some(Region { second_px: run.seconds[f].map(|s| (s as f64 / (scale * scale)) as usize), ..region }));
                 }
             }
         }
@@ -296,7 +306,11 @@ impl<'a> Run<'a> {
                 odds[row..row + r.width as usize].iter_mut().for_each(|u| *u = if m.subject { u.max(3.0) } else { BACKGROUND });
             }
         }
-        let belief = if self.options.smooth { mean_field(&odds, &maps.couplings, width as usize) } else { odds.iter().map(|u| (u / 2.0).tanh()).collect() };
+        let belief = if self.options.smooth {
+            mean_field(&odds, &maps.couplings, width as usize)
+        } else {
+            odds.iter().map(|u| (u / 2.0).tanh()).collect()
+        };
         let raw: Vec<u8> = belief.iter().map(|b| if *b > 0.0 { 255 } else { 0 }).collect();
         let raw = GrayImage::from_raw(width, height, raw).unwrap_or_else(|| GrayImage::new(width, height));
         let cleaned = follow(&open(&raw, 1), Some(self.centre));
@@ -335,7 +349,8 @@ impl<'a> Run<'a> {
         let inner = erode(mask, reach(6.0));
         let noise = noise(&maps.change);
         let (near, far) = (dilate(mask, reach(3.0)), box_vote(mask, i64::from(reach(30.0)), 0.0));
-        let colours = |wanted: &dyn Fn(usize) -> bool| -> Vec<[f32; 3]> { (0..maps.lab.len()).filter(|i| wanted(*i)).map(|i| maps.lab[i]).collect() };
+        let colours =
+            |wanted: &dyn Fn(usize) -> bool| -> Vec<[f32; 3]> { (0..maps.lab.len()).filter(|i| wanted(*i)).map(|i| maps.lab[i]).collect() };
         let inside = colours(&|i| inner.as_raw()[i] > 0 || (mask.as_raw()[i] > 0 && maps.change[i] > 2.5 * noise));
         let inside = if inside.len() > 50 { inside } else { colours(&|i| mask.as_raw()[i] > 0) };
         let round = colours(&|i| far.as_raw()[i] > 0 && near.as_raw()[i] == 0);
@@ -402,11 +417,17 @@ fn distance(mask: &GrayImage, inside: bool) -> Vec<f32> {
         for x in 0..width {
             let i = y * width + x;
             let mut best = d[i];
-            if x > 0 { best = best.min(d[i - 1] + 1.0) }
+            if x > 0 {
+                best = best.min(d[i - 1] + 1.0)
+            }
             if y > 0 {
                 best = best.min(d[i - width] + 1.0);
-                if x > 0 { best = best.min(d[i - width - 1] + DIAGONAL) }
-                if x + 1 < width { best = best.min(d[i - width + 1] + DIAGONAL) }
+                if x > 0 {
+                    best = best.min(d[i - width - 1] + DIAGONAL)
+                }
+                if x + 1 < width {
+                    best = best.min(d[i - width + 1] + DIAGONAL)
+                }
             }
             d[i] = best;
         }
@@ -415,11 +436,17 @@ fn distance(mask: &GrayImage, inside: bool) -> Vec<f32> {
         for x in (0..width).rev() {
             let i = y * width + x;
             let mut best = d[i];
-            if x + 1 < width { best = best.min(d[i + 1] + 1.0) }
+            if x + 1 < width {
+                best = best.min(d[i + 1] + 1.0)
+            }
             if y + 1 < height {
                 best = best.min(d[i + width] + 1.0);
-                if x > 0 { best = best.min(d[i + width - 1] + DIAGONAL) }
-                if x + 1 < width { best = best.min(d[i + width + 1] + DIAGONAL) }
+                if x > 0 {
+                    best = best.min(d[i + width - 1] + DIAGONAL)
+                }
+                if x + 1 < width {
+                    best = best.min(d[i + width + 1] + DIAGONAL)
+                }
             }
             d[i] = best;
         }
@@ -434,7 +461,9 @@ fn couplings(lab: &[[f32; 3]], width: usize) -> [Vec<f32>; 4] {
         let step = |i: usize| {
             let (x, y) = ((i % width) as i64 + dx, (i / width) as i64 + dy);
             let inside = (0..width as i64).contains(&x) && (0..height as i64).contains(&y);
-            if !inside { return f32::INFINITY }
+            if !inside {
+                return f32::INFINITY;
+            }
             let j = y as usize * width + x as usize;
             (0..3).map(|k| (lab[i][k] - lab[j][k]).powi(2)).sum()
         };
@@ -509,7 +538,13 @@ mod tests {
             let ground = if inside(t, x, y) { 0.0 } else { texture[(y * SIZE.0 + x) as usize] };
             let grain = ground + 6.0 * (random.random::<f64>() - 0.5);
             let stone = (x / 23 + y / 31) % 3 == 0;
-            let base = if inside(t, x, y) { [170.0, 120.0, 60.0] } else if stone { stones } else { [90.0, 140.0, 70.0] };
+            let base = if inside(t, x, y) {
+                [170.0, 120.0, 60.0]
+            } else if stone {
+                stones
+            } else {
+                [90.0, 140.0, 70.0]
+            };
             Rgb(base.map(|v: f64| (v + grain).clamp(0.0, 255.0) as u8))
         };
         let truth = |t: usize| GrayImage::from_fn(SIZE.0, SIZE.1, |x, y| Luma([if inside(t, x, y) { 255 } else { 0 }]));
@@ -546,7 +581,11 @@ mod tests {
 
     #[test]
     fn rectangles_in_the_middle_of_the_clip_serve_both_directions() {
-        let shifted: Vec<Mark> = marks().into_iter().map(|m| Mark { frame: 10, rectangle: Rectangle { x: m.rectangle.x + 30 * u32::from(m.subject), ..m.rectangle }, ..m }).filter(|m| m.subject || m.rectangle.x == 0).collect();
+        let shifted: Vec<Mark> = marks()
+            .into_iter()
+            .map(|m| Mark { frame: 10, rectangle: Rectangle { x: m.rectangle.x + 30 * u32::from(m.subject), ..m.rectangle }, ..m })
+            .filter(|m| m.subject || m.rectangle.x == 0)
+            .collect();
         let found = score(&MaskOptions::default(), &shifted, NEAR);
         assert!(found > 0.95, "{found}");
     }

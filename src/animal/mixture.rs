@@ -67,7 +67,12 @@ impl Mixture {
         for chunk in self.terms.chunks(8) {
             for (log, (mean, inverse, constant)) in logs.iter_mut().zip(chunk) {
                 let [a, b, c] = [x[0] - mean[0], x[1] - mean[1], x[2] - mean[2]];
-                let d = inverse[0] * a * a + inverse[1] * b * b + inverse[2] * c * c + inverse[3] * a * b + inverse[4] * a * c + inverse[5] * b * c;
+                let d = inverse[0] * a * a
+                    + inverse[1] * b * b
+                    + inverse[2] * c * c
+                    + inverse[3] * a * b
+                    + inverse[4] * a * c
+                    + inverse[5] * b * c;
                 *log = constant - 0.5 * d;
             }
             let best = logs[..chunk.len()].iter().copied().fold(top, f32::max);
@@ -92,14 +97,21 @@ fn start(points: &[Vector3<f64>], count: usize, random: &mut ChaCha8Rng) -> Vec<
     while centres.len() < count {
         let distance: Vec<f64> = points.iter().map(|p| nearest(&centres, p).1).collect();
         let mut left = random.random::<f64>() * distance.iter().sum::<f64>();
-        let next = distance.iter().position(|d| { left -= d; left <= 0.0 }).unwrap_or(points.len() - 1);
+        let next = distance
+            .iter()
+            .position(|d| {
+                left -= d;
+                left <= 0.0
+            })
+            .unwrap_or(points.len() - 1);
         centres.push(points[next]);
     }
     let mut own = Vec::new();
     for _ in 0..3 {
         own = points.iter().map(|p| nearest(&centres, p).0).collect();
         for (k, centre) in centres.iter_mut().enumerate() {
-            let (sum, n) = points.iter().zip(&own).filter(|(_, o)| **o == k).fold((Vector3::zeros(), 0.0), |(s, n), (p, _)| (s + p, n + 1.0));
+            let (sum, n) =
+                points.iter().zip(&own).filter(|(_, o)| **o == k).fold((Vector3::zeros(), 0.0), |(s, n), (p, _)| (s + p, n + 1.0));
             if n > 0.0 {
                 *centre = sum / n;
             }
@@ -165,7 +177,8 @@ mod tests {
         let mut normal = || (0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0;
         (0..n)
             .map(|i| {
-                let (centre, spread) = [([40.0, 120.0, 130.0], 6.0), ([150.0, 100.0, 160.0], 11.0), ([210.0, 140.0, 90.0], 4.0)][[0, 0, 1, 1, 1, 2][i % 6]];
+                let (centre, spread) =
+                    [([40.0, 120.0, 130.0], 6.0), ([150.0, 100.0, 160.0], 11.0), ([210.0, 140.0, 90.0], 4.0)][[0, 0, 1, 1, 1, 2][i % 6]];
                 let shared = normal() * spread;
                 centre.map(|c: f32| c + 0.6 * shared + normal() * spread)
             })

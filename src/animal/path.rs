@@ -67,7 +67,9 @@ mod tests {
         let mut postures: Vec<Posture> = (0..54).map(|t| posture(&horse, Gait::Walk, f64::from(t) / 26.5)).collect();
         let slip = |postures: &[Posture]| {
             let skins: Vec<_> = postures.iter().map(|p| horse.vertices(p)).collect();
-            let steps = skins.windows(2).flat_map(|w| w[0].iter().zip(&w[1]).filter(|(a, b)| a.y < 0.05 && b.y < 0.05).map(|(a, b)| (a.z - b.z).abs()).collect::<Vec<_>>());
+            let steps = skins.windows(2).flat_map(|w| {
+                w[0].iter().zip(&w[1]).filter(|(a, b)| a.y < 0.05 && b.y < 0.05).map(|(a, b)| (a.z - b.z).abs()).collect::<Vec<_>>()
+            });
             quantile(steps.collect(), 0.5).unwrap()
         };
         let before = slip(&postures);

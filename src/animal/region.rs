@@ -36,7 +36,10 @@ pub fn follow(mask: &GrayImage, near: Option<[f64; 2]>) -> Option<(GrayImage, Re
         sum.map(|s| s as f64 / piece.len() as f64)
     };
     let cost = |piece: &[usize]| match near {
-        Some(near) => { let c = centre(piece); (c[0] - near[0]).hypot(c[1] - near[1]) }
+        Some(near) => {
+            let c = centre(piece);
+            (c[0] - near[0]).hypot(c[1] - near[1])
+        }
         None => -(piece.len() as f64),
     };
     let animals = found.iter().enumerate().filter(|(_, p)| p.len() as f64 >= SPECKLE * largest as f64);
@@ -56,7 +59,8 @@ pub fn follow(mask: &GrayImage, near: Option<[f64; 2]>) -> Option<(GrayImage, Re
 /// Width and height of the smallest window that, centred on the centres of mass, holds every region and two pixels more.
 pub fn window_size(regions: &[Region]) -> [u32; 2] {
     [0, 1].map(|k| {
-        let reach = regions.iter().map(|r| (r.centre_px[k] - f64::from(r.bounds_px[k])).max(f64::from(r.bounds_px[k + 2]) - r.centre_px[k]));
+        let reach =
+            regions.iter().map(|r| (r.centre_px[k] - f64::from(r.bounds_px[k])).max(f64::from(r.bounds_px[k + 2]) - r.centre_px[k]));
         2 * (reach.fold(0.0, f64::max).ceil() as u32 + 2) + 1
     })
 }

@@ -173,7 +173,8 @@ mod tests {
         let (radii, turn) = (Vector3::new(0.5, 0.3, 1.0), 0.4f64);
         let axis = Vector3::new(0.0, turn.sin(), turn.cos());
         let creature = ellipsoids(&[(Vector3::new(0.0, 2.0, 0.0), axis, radii)]);
-        let view = View { right: Vector3::z(), up: Vector3::y(), centre: Vector3::new(0.0, 2.0, 0.1), px_per_unit: 60.0, size_px: [160, 100] };
+        let view =
+            View { right: Vector3::z(), up: Vector3::y(), centre: Vector3::new(0.0, 2.0, 0.1), px_per_unit: 60.0, size_px: [160, 100] };
         let mask = silhouette(&creature, &creature.rest(), &view);
         // Projected onto y z, the ellipsoid's quadric with axes z' (along, 1.0) and y' (0.3).
         let inside = |x: u32, y: u32| {

@@ -107,7 +107,14 @@ fn replay(creature: &Creature, take: &Take, keys: Vec<usize>, rows: &[Vec<f64>])
 }
 
 /// One model of `keys` keys over `components` components.
-pub fn one_model(creature: &Creature, take: &Take, analysis: &Analysis, keys: usize, components: usize, filter: bool) -> Result<Outcome, StudyError> {
+pub fn one_model(
+    creature: &Creature,
+    take: &Take,
+    analysis: &Analysis,
+    keys: usize,
+    components: usize,
+    filter: bool,
+) -> Result<Outcome, StudyError> {
     let points = analysis.rhythm.points(&analysis.eigen, components, filter);
     let Selection { frames, .. } = select(&points, keys)?;
     let weights = single(&points, &frames, false)?;
@@ -153,7 +160,15 @@ mod tests {
             let (creature, take, analysis) = gait(which);
             let error = |keys, components| one_model(&creature, &take, &analysis, keys, components, false).unwrap().error.mean_deg;
             let four = error(4, 2);
-            println!("{}: {:.2} {:.2} {four:.2} {:.2}, one {:.2}, three {:.2}", which.name(), error(2, 2), error(3, 2), error(5, 2), error(4, 1), error(4, 3));
+            println!(
+                "{}: {:.2} {:.2} {four:.2} {:.2}, one {:.2}, three {:.2}",
+                which.name(),
+                error(2, 2),
+                error(3, 2),
+                error(5, 2),
+                error(4, 1),
+                error(4, 3)
+            );
             assert!(four < least && error(2, 2) > four && error(3, 2) > four, "{four}");
             // The fifth key gains less than a degree, and a third component nothing that matters.
             assert!(error(5, 2) > four - 1.0 && error(4, 1) > four && error(4, 3) > four - 0.5);
@@ -180,7 +195,13 @@ mod tests {
         let drawn = analyse(&sketch_horse(&creature, &take, 2.0), true, 0).unwrap();
         assert_eq!(drawn.rhythm.verdict, crate::animal::rhythm::Verdict::Usable, "{:?}", drawn.rhythm);
         let error = |a: &Analysis, filter| one_model(&creature, &take, a, 4, 2, filter).unwrap().error.mean_deg;
-        println!("gallop from masks {:.2} (filtered {:.2}), from strokes {:.2} ({:.2})", error(&masks, false), error(&masks, true), error(&drawn, false), error(&drawn, true));
+        println!(
+            "gallop from masks {:.2} (filtered {:.2}), from strokes {:.2} ({:.2})",
+            error(&masks, false),
+            error(&masks, true),
+            error(&drawn, false),
+            error(&drawn, true)
+        );
         assert!(error(&drawn, true) < error(&masks, true) + 1.5);
     }
 }

@@ -126,7 +126,15 @@ mod tests {
     #[test]
     fn records_come_back_and_foreign_ones_are_named() {
         let folder = tempfile::tempdir().unwrap();
-        let record = KeysRecord { keys: vec![3, 9], components: 2, doubled: false, condition: 1.25, exact: true, bound: 1.25, alternates: vec![Alternate { key: 3, frame: 16, distance: 0.1 }] };
+        let record = KeysRecord {
+            keys: vec![3, 9],
+            components: 2,
+            doubled: false,
+            condition: 1.25,
+            exact: true,
+            bound: 1.25,
+            alternates: vec![Alternate { key: 3, frame: 16, distance: 0.1 }],
+        };
         write(folder.path(), &record).unwrap();
         assert_eq!(read::<KeysRecord>(folder.path()).unwrap(), record);
         std::fs::write(folder.path().join("analysis.json"), "{\"fps\": 3}").unwrap();

@@ -21,7 +21,8 @@ pub fn read(path: &Path) -> Result<Creature, BvhError> {
         recording.joints.iter().map(|j| Bone { name: j.name.clone(), parent: j.parent, rest: Local::at(j.offset) }).collect();
     let posture = |frame: &super::mapping::RecordedFrame| -> Posture {
         let local = |(k, bone): (usize, &Bone)| {
-            let (parent, from) = bone.parent.map_or((UnitQuaternion::identity(), Vector3::zeros()), |p| (frame.rotations[p], frame.positions[p]));
+            let (parent, from) =
+                bone.parent.map_or((UnitQuaternion::identity(), Vector3::zeros()), |p| (frame.rotations[p], frame.positions[p]));
             let rotation = parent.inverse() * frame.rotations[k];
             Local { rotation, ..Local::at(parent.inverse() * (frame.positions[k] - from)) }
         };
@@ -80,8 +81,16 @@ fn write_bone(text: &mut String, creature: &Creature, places: &[Vector3<f64>], k
     let indent = "  ".repeat(depth);
     let bone = &creature.bones[k];
     let offset = bone.parent.map_or(places[k], |p| places[k] - places[p]);
-    let (kind, channels) = if root { ("ROOT", "6 Xposition Yposition Zposition Zrotation Xrotation Yrotation") } else { ("JOINT", "3 Zrotation Xrotation Yrotation") };
-    let _ = writeln!(text, "{indent}{kind} {}\n{indent}{{\n{indent}  OFFSET {:.6} {:.6} {:.6}\n{indent}  CHANNELS {channels}", bone.name, offset.x, offset.y, offset.z);
+    let (kind, channels) = if root {
+        ("ROOT", "6 Xposition Yposition Zposition Zrotation Xrotation Yrotation")
+    } else {
+        ("JOINT", "3 Zrotation Xrotation Yrotation")
+    };
+    let _ = writeln!(
+        text,
+        "{indent}{kind} {}\n{indent}{{\n{indent}  OFFSET {:.6} {:.6} {:.6}\n{indent}  CHANNELS {channels}",
+        bone.name, offset.x, offset.y, offset.z
+    );
     order.push(k);
     let children: Vec<usize> = (0..creature.bones.len()).filter(|c| creature.bones[*c].parent == Some(k)).collect();
     children.iter().for_each(|c| write_bone(text, creature, places, *c, depth + 1, false, order));
@@ -117,7 +126,12 @@ mod tests {
                 assert!((ours[k].column(3) - theirs[other].column(3)).norm() < 1e-4, "{}", bone.name);
             }
             let returned = horse.posture_from(&back, found).unwrap();
-            assert!(returned.iter().zip(wanted).all(|(a, b)| a.rotation.angle_to(&b.rotation) < 1e-5 && (a.translation - b.translation).norm() < 1e-4));
+            assert!(
+                returned
+                    .iter()
+                    .zip(wanted)
+                    .all(|(a, b)| a.rotation.angle_to(&b.rotation) < 1e-5 && (a.translation - b.translation).norm() < 1e-4)
+            );
         }
     }
 }

@@ -57,7 +57,11 @@ fn check_extents(document: &gltf::Document, blob: &[u8]) -> Result<(), String> {
     for accessor in document.accessors() {
         let Some(view) = accessor.view() else { continue };
         let stride = view.stride().unwrap_or(accessor.size());
-        let reach = accessor.count().saturating_sub(1).checked_mul(stride).and_then(|r| r.checked_add(accessor.size())?.checked_add(accessor.offset()));
+        let reach = accessor
+            .count()
+            .saturating_sub(1)
+            .checked_mul(stride)
+            .and_then(|r| r.checked_add(accessor.size())?.checked_add(accessor.offset()));
         if reach.is_none_or(|r| r > view.length()) {
             return Err(format!("accessor {} reaches beyond its buffer view; the file is damaged", accessor.index()));
         }
@@ -144,7 +148,8 @@ fn primitive(primitive: &gltf::Primitive, blob: &[u8], joints: &[usize], binds: 
         let weights = if sum > 0.0 { raw.map(|w| w / sum) } else { [1.0, 0.0, 0.0, 0.0] };
         let Some(&joint) = joints.get(own[0]) else { continue };
         // A second skin of the same joint with another bind pose: the vertex is moved into the first one's mesh space.
-        let position = skin.bone_from_mesh[joint].try_inverse().map_or(vector(*position), |m| (m * binds[own[0]] * vector(*position).push(1.0)).xyz());
+        let position =
+            skin.bone_from_mesh[joint].try_inverse().map_or(vector(*position), |m| (m * binds[own[0]] * vector(*position).push(1.0)).xyz());
         let colour = colours.get(i).copied().unwrap_or(material);
         skin.vertices.push(Vertex { position, bones: own.map(|b| joints[b] as u16), weights, colour });
     }
@@ -275,7 +280,11 @@ impl Binary {
         let extreme = |pick: fn(f32, f32) -> f32, start: f32| -> Vec<f32> {
             (0..N).map(|k| rows.iter().map(|r| r[k] as f32).fold(start, pick)).collect()
         };
-        let range = if with_range { json!({ "min": extreme(f32::min, f32::INFINITY), "max": extreme(f32::max, f32::NEG_INFINITY) }) } else { json!({}) };
+        let range = if with_range {
+            json!({ "min": extreme(f32::min, f32::INFINITY), "max": extreme(f32::max, f32::NEG_INFINITY) })
+        } else {
+            json!({})
+        };
         self.push(bytes, F32, kind, rows.len(), range)
     }
 }
@@ -296,9 +305,11 @@ fn encode(creature: &Creature) -> Vec<u8> {
         root["materials"] = json!([{ "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 0.9 }, "doubleSided": true }]);
         let binds: Vec<[f64; 16]> = creature.skin.bone_from_mesh.iter().map(|m| std::array::from_fn(|i| m[(i % 4, i / 4)])).collect();
         let binds = binary.floats(&binds, "MAT4", false);
-        root["skins"] = json!([{ "joints": (0..creature.bones.len()).collect::<Vec<_>>(), "inverseBindMatrices": binds, "skeleton": roots[0] }]);
+        root["skins"] =
+            json!([{ "joints": (0..creature.bones.len()).collect::<Vec<_>>(), "inverseBindMatrices": binds, "skeleton": roots[0] }]);
     }
-    let animations: Vec<Value> = creature.motions.iter().filter(|m| !m.postures.is_empty()).map(|m| animation(creature, m, &mut binary)).collect();
+    let animations: Vec<Value> =
+        creature.motions.iter().filter(|m| !m.postures.is_empty()).map(|m| animation(creature, m, &mut binary)).collect();
     if !animations.is_empty() {
         root["animations"] = json!(animations);
     }
@@ -445,7 +456,13 @@ mod tests {
             let creature = read(&file).unwrap();
             let [low, high] = creature.bounds().unwrap();
             let size = high - low;
-            println!("{}: {} bones, {} triangles, {size:.2?}, {:?}", file.display(), creature.bones.len(), creature.skin.triangles.len(), creature.motions.iter().map(|m| (&m.name, m.duration_s())).collect::<Vec<_>>());
+            println!(
+                "{}: {} bones, {} triangles, {size:.2?}, {:?}",
+                file.display(),
+                creature.bones.len(),
+                creature.skin.triangles.len(),
+                creature.motions.iter().map(|m| (&m.name, m.duration_s())).collect::<Vec<_>>()
+            );
             assert!(size.z > size.x && size.y > size.x && low.y.abs() < 0.1 * size.y);
             let gallop = creature.motions.iter().find(|m| m.name.ends_with("Gallop")).unwrap();
             assert!((0.4..0.8).contains(&gallop.duration_s()) && gallop.postures.len() > 5);

@@ -53,7 +53,11 @@ pub fn plane(points: &[Vec<f64>], keys: &[usize], alternates: &[usize]) -> Resul
     for (frames, colour, filled) in [(alternates, PALETTE[2], false), (keys, RIGHT, true)] {
         for frame in frames {
             let Some(p) = place(*frame) else { continue };
-            if filled { canvas.disc(p, 8.0, colour)? } else { canvas.circle(p, 10.0, colour, 3)? }
+            if filled {
+                canvas.disc(p, 8.0, colour)?
+            } else {
+                canvas.circle(p, 10.0, colour, 3)?
+            }
             let away = (p[0] - SIDE / 2.0).hypot(p[1] - SIDE / 2.0).max(1.0);
             let label = [0, 1].map(|k| p[k] + (p[k] - SIDE / 2.0) / away * 22.0);
             canvas.text([label[0], label[1] + 5.0], &frame.to_string(), 11.0, colour, Align::Centre)?;
@@ -131,7 +135,8 @@ pub fn outlined(frame: &RgbImage, mask: &GrayImage) -> Result<RgbImage, ReportEr
 pub fn mask_sheet(frames: &[RgbImage], masks: &[GrayImage], count: usize) -> Result<RgbImage, ReportError> {
     let n = frames.len().min(masks.len());
     let shown: Vec<usize> = (0..count.min(n)).map(|i| i * n / count.min(n)).collect();
-    let tiles = shown.iter().map(|t| Ok((outlined(&frames[*t], &masks[*t])?, format!("frame {t}")))).collect::<Result<Vec<_>, ReportError>>()?;
+    let tiles =
+        shown.iter().map(|t| Ok((outlined(&frames[*t], &masks[*t])?, format!("frame {t}")))).collect::<Result<Vec<_>, ReportError>>()?;
     strip(&tiles, 4, 320)
 }
 
@@ -140,7 +145,9 @@ pub fn keys_and_poses(images: &[(RgbImage, String)], poses: &[RgbImage], columns
     let mut tiles = Vec::new();
     for (block, pictures) in images.chunks(columns).enumerate() {
         tiles.extend(pictures.iter().cloned());
-        tiles.extend((pictures.len()..columns).filter(|_| images.len() > columns).map(|_| (RgbImage::from_pixel(4, 3, Rgb(WHITE)), String::new())));
+        tiles.extend(
+            (pictures.len()..columns).filter(|_| images.len() > columns).map(|_| (RgbImage::from_pixel(4, 3, Rgb(WHITE)), String::new())),
+        );
         tiles.extend(poses.iter().skip(block * columns).take(pictures.len()).map(|p| (p.clone(), "pose".to_string())));
     }
     strip(&tiles, columns.min(images.len()), 240)
@@ -163,7 +170,8 @@ mod tests {
     fn every_figure_shows_what_it_is_for() {
         let horse = horse();
         let view = View::side(&horse, [160, 120]);
-        let masks: Vec<GrayImage> = (0..40).map(|t| silhouette(&horse, &posture(&horse, Gait::Canter, f64::from(t) / 16.0), &view)).collect();
+        let masks: Vec<GrayImage> =
+            (0..40).map(|t| silhouette(&horse, &posture(&horse, Gait::Canter, f64::from(t) / 16.0), &view)).collect();
         let found = analyse(&masks, false, 0).unwrap();
         let points = found.rhythm.points(&found.eigen, 2, true);
         let sheet = eigenimages(&found.eigen, 3).unwrap();

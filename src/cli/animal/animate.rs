@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail, ensure};
 use image::imageops;
 use muybridge::animal::blend::PoseSpace;
 use muybridge::animal::creature::{Creature, Motion, Posture};
-use muybridge::animal::region::Region;
 use muybridge::animal::path::{by_contact, by_region, travel};
+use muybridge::animal::region::Region;
 use muybridge::animal::render::{View, shaded};
 use muybridge::animal::switching::{Weights, single, switched};
 use muybridge::io::{creature_bvh, glb, write_atomic};
@@ -90,10 +90,15 @@ pub fn read_poses(template: &Creature, choices: &AnimateChoices, keys: usize) ->
     let posed = read_creature(&choices.poses)?;
     let names: Vec<&str> = posed.motions.iter().map(|m| m.name.as_str()).collect();
     let motion = match (&choices.motion, posed.motions.as_slice()) {
-        (Some(name), list) => list.iter().find(|m| m.name == *name).with_context(|| format!("{path}: no animation '{name}'; it has {}", names.join(", ")))?,
+        (Some(name), list) => {
+            list.iter().find(|m| m.name == *name).with_context(|| format!("{path}: no animation '{name}'; it has {}", names.join(", ")))?
+        }
         (None, [only]) => only,
         (None, []) => bail!("{path}: holds no animation; export the frames of the template with it"),
-        (None, list) => list.iter().find(|m| m.name == "keys").with_context(|| format!("{path}: several animations ({}); choose with --motion", names.join(", ")))?,
+        (None, list) => list
+            .iter()
+            .find(|m| m.name == "keys")
+            .with_context(|| format!("{path}: several animations ({}); choose with --motion", names.join(", ")))?,
     };
     let found = motion.postures.len();
     ensure!(found == keys, "{path}: {found} frames where the template has {keys}, one per key image; export exactly these frames");
@@ -170,7 +175,11 @@ pub fn write(output: &Path, a: &Animation) -> Result<()> {
 
 fn publish(partial: tempfile::TempDir, output: &Path) -> Result<()> {
     let occupied = output.exists() && output.read_dir().map(|mut e| e.next().is_some()).unwrap_or(true);
-    ensure!(!occupied || output.join("weights.csv").exists(), "{} exists already and is no folder of `muybridge animal animate`; remove it or choose another one with -o", output.display());
+    ensure!(
+        !occupied || output.join("weights.csv").exists(),
+        "{} exists already and is no folder of `muybridge animal animate`; remove it or choose another one with -o",
+        output.display()
+    );
     if output.exists() {
         std::fs::remove_dir_all(output).with_context(|| format!("cannot replace {}", output.display()))?;
     }

@@ -152,7 +152,10 @@ fn alternates(analysed: &Analysed, points: &[Vec<f64>], keys: &[usize], choices:
                 inside.with_context(|| format!("frame {frame} cannot be the alternate of key {}", key + first))?
             }
             None => candidates(points, turns.as_deref(), key).into_iter().find(free).with_context(|| {
-                format!("key {} has no silhouette in the other half of a stride; take a longer part of the clip, or leave --double out", key + first)
+                format!(
+                    "key {} has no silhouette in the other half of a stride; take a longer part of the clip, or leave --double out",
+                    key + first
+                )
             })?,
         };
         found.push(Alternate { key: key + first, frame: frame + first, distance: squared_distance(&points[key], &points[frame]).sqrt() });
@@ -164,9 +167,13 @@ fn alternates(analysed: &Analysed, points: &[Vec<f64>], keys: &[usize], choices:
 pub fn words(record: &KeysRecord) -> String {
     let list: Vec<String> = record.keys.iter().map(|k| k.to_string()).collect();
     let mut text = format!("keys: frames {}\ncondition number {:.4}, ", list.join(", "), record.condition);
-    text += &if record.exact { "the smallest there is\n".into() } else { format!("by a heuristic; no choice is below {:.4}\n", record.bound) };
+    text +=
+        &if record.exact { "the smallest there is\n".into() } else { format!("by a heuristic; no choice is below {:.4}\n", record.bound) };
     for a in &record.alternates {
-        text += &format!("key {} looks like frame {} of the other half of the stride (distance {:.2}); --reject {} asks for another\n", a.key, a.frame, a.distance, a.frame);
+        text += &format!(
+            "key {} looks like frame {} of the other half of the stride (distance {:.2}); --reject {} asks for another\n",
+            a.key, a.frame, a.distance, a.frame
+        );
     }
     text
 }

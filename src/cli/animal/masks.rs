@@ -67,7 +67,11 @@ pub fn make(video: &Path, choices: &MaskChoices, output: &Path) -> Result<Vec<Rg
     let mark = |subject: bool| {
         move |p: &Placed| {
             // `x,y,w,h` is on the clip's first used frame, FRAME:… counts as the video does.
-            let frame = if p.frame == 0 { 0 } else { p.frame.checked_sub(first).with_context(|| format!("frame {} of a rectangle is before --frames", p.frame))? };
+            let frame = if p.frame == 0 {
+                0
+            } else {
+                p.frame.checked_sub(first).with_context(|| format!("frame {} of a rectangle is before --frames", p.frame))?
+            };
             anyhow::Ok(Mark { frame, subject, rectangle: p.rectangle })
         }
     };
@@ -97,9 +101,15 @@ pub fn make(video: &Path, choices: &MaskChoices, output: &Path) -> Result<Vec<Rg
     if !missing.is_empty() {
         eprintln!("notice: no silhouette in frame {}; their masks are black", shortened(&missing));
     }
-    let seconds: Vec<String> = (0..found.regions.len()).filter(|t| found.regions[*t].is_some_and(|r| r.second_px.is_some())).map(|t| (t + first).to_string()).collect();
+    let seconds: Vec<String> = (0..found.regions.len())
+        .filter(|t| found.regions[*t].is_some_and(|r| r.second_px.is_some()))
+        .map(|t| (t + first).to_string())
+        .collect();
     if !seconds.is_empty() {
-        eprintln!("notice: a second region half as large or larger in frame {}; the one nearest to the frame before is followed", shortened(&seconds));
+        eprintln!(
+            "notice: a second region half as large or larger in frame {}; the one nearest to the frame before is followed",
+            shortened(&seconds)
+        );
     }
     let partial = whole::beside(output)?;
     write_masks(partial.path(), &found.masks)?;

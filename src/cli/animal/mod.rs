@@ -147,7 +147,11 @@ fn replace<R: Record>(partial: TempDir, folder: &Path) -> Result<()> {
         let failed = || format!("cannot read {}", folder.display());
         let occupied = folder.read_dir().with_context(failed)?.next().is_some();
         if occupied && !folder.join(R::FILE).exists() {
-            bail!("{} exists already and is no folder of `muybridge animal {}`; remove it or choose another one with -o", folder.display(), R::STAGE);
+            bail!(
+                "{} exists already and is no folder of `muybridge animal {}`; remove it or choose another one with -o",
+                folder.display(),
+                R::STAGE
+            );
         }
         std::fs::remove_dir_all(folder).with_context(|| format!("cannot replace {}", folder.display()))?;
     }
@@ -165,7 +169,12 @@ fn read_analysis(folder: &Path) -> Result<Analysed> {
     let record: AnalysisRecord = animal_json::read(folder)?;
     let windows = read_masks(&folder.join("windows"), None)?;
     if windows.len() != record.regions.len() {
-        bail!("{}: {} windows where analysis.json has {} frames; run `muybridge animal analyse` again", folder.display(), windows.len(), record.regions.len());
+        bail!(
+            "{}: {} windows where analysis.json has {} frames; run `muybridge animal analyse` again",
+            folder.display(),
+            windows.len(),
+            record.regions.len()
+        );
     }
     let eigen = eigenimages(&windows, COMPONENTS, record.trend_degree)?;
     Ok(Analysed { record, windows, eigen })
@@ -182,7 +191,8 @@ fn read_keys(folder: &Path, analysed: &Analysed) -> Result<(KeysRecord, Vec<usiz
     let record: KeysRecord = animal_json::read(folder)?;
     let first = analysed.record.first_frame;
     let places: Option<Vec<usize>> = record.keys.iter().map(|k| k.checked_sub(first).filter(|p| *p < analysed.windows.len())).collect();
-    let places = places.with_context(|| format!("{}: its keys are not frames of this analysis; run `muybridge animal keys` again", folder.display()))?;
+    let places = places
+        .with_context(|| format!("{}: its keys are not frames of this analysis; run `muybridge animal keys` again", folder.display()))?;
     Ok((record, places))
 }
 

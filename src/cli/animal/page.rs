@@ -35,12 +35,18 @@ pub fn write(folder: &Path, title: &str) -> Result<()> {
         let path = folder.join(name);
         if path.exists() {
             let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
-            body += &format!("<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>\n", base64(&bytes));
+            body += &format!(
+                "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>\n",
+                base64(&bytes)
+            );
         }
     }
     let style = "body{font:16px/1.5 sans-serif;max-width:1040px;margin:2em auto;padding:0 1em;color:#282828}img{max-width:100%}\
                  figure{margin:2em 0}figcaption{color:#666}pre{background:#f4f4f4;padding:1em;overflow-x:auto}";
-    let page = format!("<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{}</title><style>{style}</style></head><body>\n{body}</body></html>\n", escaped(title));
+    let page = format!(
+        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{}</title><style>{style}</style></head><body>\n{body}</body></html>\n",
+        escaped(title)
+    );
     let path = folder.join("report.html");
     write_atomic(&path, page.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }

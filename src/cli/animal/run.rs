@@ -68,9 +68,14 @@ pub fn run(args: &RunArgs) -> Result<()> {
     match &study.animate {
         Some(choices) => {
             let folder = output.join("animation");
-            stages.once("animation", &[&before, &json(choices)?, &digest(&choices.poses)?], || animate::make(&analysis, &chosen, choices, &folder))?;
+            stages.once("animation", &[&before, &json(choices)?, &digest(&choices.poses)?], || {
+                animate::make(&analysis, &chosen, choices, &folder)
+            })?;
         }
-        None => println!("next: set a pose on every frame of {}, and name the file as poses in [animate]", chosen.join("template.glb").display()),
+        None => println!(
+            "next: set a pose on every frame of {}, and name the file as poses in [animate]",
+            chosen.join("template.glb").display()
+        ),
     }
     page::write(&output, &name)?;
     println!("report: {}", output.join("report.html").display());
@@ -102,7 +107,8 @@ fn digest(path: &Path) -> Result<String> {
     let failed = || format!("cannot read {}", path.display());
     let mut hasher = blake3::Hasher::new();
     if path.is_dir() {
-        let mut files: Vec<PathBuf> = path.read_dir().with_context(failed)?.filter_map(|e| Some(e.ok()?.path())).filter(|p| p.is_file()).collect();
+        let mut files: Vec<PathBuf> =
+            path.read_dir().with_context(failed)?.filter_map(|e| Some(e.ok()?.path())).filter(|p| p.is_file()).collect();
         files.sort();
         for file in files {
             hasher.update(file.file_name().map_or(&[][..], |n| n.as_encoded_bytes()));

@@ -59,7 +59,8 @@ struct Desk {
 pub fn run(args: &SketchArgs) -> Result<()> {
     let clip = read_clip(&args.video, None)?;
     clip.notices.iter().for_each(|n| eprintln!("notice: {n}"));
-    let server = Server::http(("127.0.0.1", args.port)).map_err(|e| anyhow!("cannot listen on 127.0.0.1:{}: {e}; choose another --port", args.port))?;
+    let server = Server::http(("127.0.0.1", args.port))
+        .map_err(|e| anyhow!("cannot listen on 127.0.0.1:{}: {e}; choose another --port", args.port))?;
     let port = server.server_addr().to_ip().map_or(args.port, |a| a.port());
     std::fs::create_dir_all(&args.output).with_context(|| format!("cannot create {}", args.output.display()))?;
     let desk = Desk { frames: clip.frames, folder: args.output.clone(), port };
@@ -126,7 +127,10 @@ impl Desk {
                 None => Reply::wrong(404, "no such frame"),
             },
             (Method::Get, ["strokes", n]) => match frame(n) {
-                Some(n) => Reply::ok("application/json", std::fs::read(self.path(n, "json")).unwrap_or_else(|_| b"{\"strokes\":[],\"rectangles\":[]}".to_vec())),
+                Some(n) => Reply::ok(
+                    "application/json",
+                    std::fs::read(self.path(n, "json")).unwrap_or_else(|_| b"{\"strokes\":[],\"rectangles\":[]}".to_vec()),
+                ),
                 None => Reply::wrong(404, "no such frame"),
             },
             (Method::Post, ["strokes", n]) => match (frame(n), serde_json::from_str::<Drawing>(body)) {
@@ -146,7 +150,8 @@ impl Desk {
     }
 
     fn save(&self, frame: usize, drawing: &Drawing) -> Result<()> {
-        let sound = drawing.strokes.iter().all(|s| (0.0..=1000.0).contains(&s.width_px) && s.points.iter().flatten().all(|v| v.is_finite()));
+        let sound =
+            drawing.strokes.iter().all(|s| (0.0..=1000.0).contains(&s.width_px) && s.points.iter().flatten().all(|v| v.is_finite()));
         anyhow::ensure!(sound, "strokes must have finite points and widths from 0 to 1000 px");
         let picture = strokes(&drawing.strokes, self.frames[frame].dimensions().into());
         let failed = |path: &Path| format!("cannot write {}", path.display());

@@ -68,7 +68,12 @@ fn filtered(points: &[Vec<f64>], filter: bool) -> Vec<Vec<f64>> {
         // The band has no mean; the animal's build does.
         let mean = own.iter().sum::<f64>() / own.len() as f64;
         let passed = band_pass(&own, found.band);
-        println!("PC{}: r = {:.2} in the band of {:.1} frames a silhouette", k + 1, correlation(&own, &passed), own.len() as f64 / found.centre);
+        println!(
+            "PC{}: r = {:.2} in the band of {:.1} frames a silhouette",
+            k + 1,
+            correlation(&own, &passed),
+            own.len() as f64 / found.centre
+        );
         result.iter_mut().zip(passed).for_each(|(p, v)| p[k] = v + mean);
     }
     result

@@ -79,7 +79,10 @@ fn table(creature: &Creature, take: &Take, analysis: &Analysis, filter: bool) ->
         println!("{}", line.trim_end());
     }
     match switching_models(creature, take, analysis, filter) {
-        Ok(found) => println!("    4+4 keys, 2 components, switching: {:.2} ({:.2}), frames {:?}", found.error.mean_deg, found.error.sd_deg, found.keys),
+        Ok(found) => println!(
+            "    4+4 keys, 2 components, switching: {:.2} ({:.2}), frames {:?}",
+            found.error.mean_deg, found.error.sd_deg, found.keys
+        ),
         Err(e) => println!("    4+4 keys, switching: {e}"),
     }
     Ok(())
@@ -89,10 +92,18 @@ fn table(creature: &Creature, take: &Take, analysis: &Analysis, filter: bool) ->
 fn beside_strokes(horse: &Creature, take: &Take, masks: &Analysis, gait: Gait) -> Result<()> {
     let drawn = analyse(&sketch_horse(horse, take, 2.0), true, 0)?;
     for (name, analysis) in [("masks", masks), ("strokes", &drawn)] {
-        let found = if gait == Gait::Walk { switching_models(horse, take, analysis, true) } else { one_model(horse, take, analysis, 4, 2, true) };
+        let found =
+            if gait == Gait::Walk { switching_models(horse, take, analysis, true) } else { one_model(horse, take, analysis, 4, 2, true) };
         let r: Vec<String> = analysis.rhythm.correlations.iter().map(|r| format!("{r:.2}")).collect();
         match found {
-            Ok(found) => println!("  from {name}: r {}, {}, keys {:?}, error {:.2} ({:.2})", r.join(" "), analysis.rhythm.verdict.words(), found.keys, found.error.mean_deg, found.error.sd_deg),
+            Ok(found) => println!(
+                "  from {name}: r {}, {}, keys {:?}, error {:.2} ({:.2})",
+                r.join(" "),
+                analysis.rhythm.verdict.words(),
+                found.keys,
+                found.error.mean_deg,
+                found.error.sd_deg
+            ),
             Err(e) => println!("  from {name}: r {}, {}: {e}", r.join(" "), analysis.rhythm.verdict.words()),
         }
     }
@@ -139,7 +150,12 @@ fn search_time() -> Result<()> {
         let begun = Instant::now();
         let found = select(&points, keys)?;
         let how = if found.exact { "exact".to_string() } else { format!("heuristic, no set is below {:.4}", found.bound) };
-        println!("{keys} keys of 137 frames: condition {:.4}, {how}, {} sets evaluated, {:.2} s", found.condition, found.evaluations, begun.elapsed().as_secs_f64());
+        println!(
+            "{keys} keys of 137 frames: condition {:.4}, {how}, {} sets evaluated, {:.2} s",
+            found.condition,
+            found.evaluations,
+            begun.elapsed().as_secs_f64()
+        );
     }
     Ok(())
 }
