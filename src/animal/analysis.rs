@@ -108,8 +108,8 @@ mod tests {
         let known = analyse(&gallop(40, 60.0, [240, 180]), false, 0).unwrap();
         let mirrored: Vec<GrayImage> = gallop(40, 42.0, [200, 160]).iter().map(image::imageops::flip_horizontal).collect();
         let fitted = fitted_windows(&mirrored, &known.windows, true).unwrap();
-        for t in 0..40 {
-            let p = known.eigen.project(&fitted[t]);
+        for (t, window) in fitted.iter().enumerate() {
+            let p = known.eigen.project(window);
             let away = (0..2).map(|k| (p[k] - known.eigen.coefficients[(t, k)]).powi(2)).sum::<f64>().sqrt();
             assert!(away < 0.35, "{t}: {away}");
         }

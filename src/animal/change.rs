@@ -193,10 +193,9 @@ fn accumulate(here: &Mat, other: &Mat, here_from_other: &Matrix3<f64>, smallest:
         *seen += 1;
         let squares = (0..3).map(|k| f32::from(c[k].saturating_sub(high[k]).max(low[k].saturating_sub(c[k]))).powi(2));
         let change = squares.sum::<f32>().sqrt();
-        // NaN compares false: empty places are taken first.
-        if !(change >= two[0]) {
+        if two[0].is_nan() || change < two[0] {
             *two = [change, two[0]];
-        } else if !(change >= two[1]) {
+        } else if two[1].is_nan() || change < two[1] {
             two[1] = change;
         }
     }

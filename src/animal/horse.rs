@@ -113,7 +113,10 @@ impl Gait {
     }
 }
 
-fn parts() -> Vec<(String, String, Vector3<f64>, Vector3<f64>, f64)> {
+/// A [`Part`] of one side: name, parent, joint, end, radius.
+type Sided = (String, String, Vector3<f64>, Vector3<f64>, f64);
+
+fn parts() -> Vec<Sided> {
     let trunk = TRUNK.iter().map(|p| (p.0.to_string(), p.1.to_string(), Vector3::from(p.2), Vector3::from(p.3), p.4));
     let side = |mark: &'static str, sign: f64| {
         HIND.iter().chain(&FORE).map(move |p| {

@@ -522,7 +522,7 @@ mod tests {
         let (dx, dy) = (f64::from(x) - 45.0 - 3.0 * t as f64, f64::from(y) - 60.0);
         let body = (dx / 26.0).powi(2) + (dy / 13.0).powi(2) < 1.0;
         let slope = 0.5 * (t as f64 * 0.8).sin();
-        let leg = |at: f64, slope: f64| dy >= 0.0 && dy < 34.0 && (dx - at - slope * dy).abs() < 4.0;
+        let leg = |at: f64, slope: f64| (0.0..34.0).contains(&dy) && (dx - at - slope * dy).abs() < 4.0;
         body || leg(-16.0, slope) || leg(15.0, -slope)
     }
 
@@ -537,7 +537,7 @@ mod tests {
         let mut pixel = |t: usize, x: u32, y: u32| {
             let ground = if inside(t, x, y) { 0.0 } else { texture[(y * SIZE.0 + x) as usize] };
             let grain = ground + 6.0 * (random.random::<f64>() - 0.5);
-            let stone = (x / 23 + y / 31) % 3 == 0;
+            let stone = (x / 23 + y / 31).is_multiple_of(3);
             let base = if inside(t, x, y) {
                 [170.0, 120.0, 60.0]
             } else if stone {
