@@ -8,8 +8,7 @@
 //!     + [signed distance to the previous mask, carried along by the optical flow, over 6 px of 448] (−4 … 3;
 //!       down to a quarter where the flow leads to another colour, by 10 to 30 grey levels)         (1)
 //! In the frame of the rectangles the last term falls off with the distance from the subject's rectangle. Mean-field
-//! inference of a Potts model whose couplings fall with the colour step (GrabCut's, Rother et al. 2004) smooths U along
-//! edges:  q_i ← tanh(U_i/2 + λ Σ_j w_ij q_j).                                                                (2)
+//! inference of a Potts model whose couplings fall with the colour step ([`super::field`]) smooths U along edges.
 //! Both mixtures are learnt anew every 5 frames, the animal's from the mask's inside, the scenery's from round it.
 //! Departure from Favreau et al. (2004): they classify by colour alone. Change and carrying make animals of the colour of
 //! their surroundings possible. Fails when animal and scenery agree in colour and the animal stands still.
@@ -19,6 +18,7 @@ use image::{GrayImage, ImageBuffer, Luma, RgbImage, imageops};
 use rayon::prelude::*;
 
 use super::change::{Scenery, lab};
+use super::field::{couplings, distance, mean_field};
 use super::mixture::Mixture;
 use super::region::{Region, follow};
 use crate::footage::regions::{area_px, box_vote, dilate, erode, fill_holes, open};
@@ -30,9 +30,6 @@ const WORKING_PX: u32 = 448;
 const BATCH: usize = 24;
 const GAUSSIANS: usize = 5;
 const BACKGROUND: f32 = -20.0;
-/// Size of the couplings λ of equation (2).
-const COUPLING: f32 = 1.5;
-const ROUNDS: usize = 10;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Rectangle {
@@ -54,7 +51,7 @@ pub struct Mark {
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MaskOptions {
-    /// Edge-aware smoothing, equation (2).
+    /// Edge-aware smoothing.
     pub smooth: bool,
     /// The change against the registered scenery; off for animals that stand, or scenery with parallax.
     pub motion: bool,
@@ -108,54 +105,30 @@ pub fn silhouettes(
     check(frames, marks)?;
     let (width, height) = frames[0].dimensions();
     let scale = (f64::from(WORKING_PX) / f64::from(width.max(height))).min(1.0);
-    let small = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
+    let [small_width, small_height] = [width, height].map(|n| ((f64::from(n) * scale).round() as u32).max(1));
     let working: Vec<RgbImage> = if scale < 1.0 {
-        frames.par_iter().map(|f| shrink(f, small(width), small(height))).collect::<opencv::Result<_>>()?
+        frames.par_iter().map(|f| shrink(f, small_width, small_height)).collect::<opencv::Result<_>>()?
     } else {
         frames.to_vec()
     };
-    let marks: Vec<Mark> =
-        marks.iter().map(|m| Mark { rectangle: scaled(m.rectangle, scale, small(width), small(height)), ..*m }).collect();
+    let marks: Vec<Mark> = marks.iter().map(|m| Mark { rectangle: scaled(m.rectangle, scale, small_width, small_height), ..*m }).collect();
     let scenery = Scenery::new(&working)?;
     let mut run = Run::new(&working, &marks, options, &scenery)?;
-    let anchor = marks.iter().filter(|m| m.subject).map(|m| m.frame).min().unwrap_or(0);
-    let mut small_masks: Vec<GrayImage> = vec![GrayImage::new(small(width), small(height)); frames.len()];
-    let mut soft: Vec<Vec<f32>> = vec![Vec::new(); frames.len()];
-    let first = run.anchor;
-    let forward: Vec<(usize, Option<usize>)> = (anchor..frames.len()).map(|f| (f, f.checked_sub(1).filter(|p| *p >= anchor))).collect();
-    let backward: Vec<(usize, Option<usize>)> = (0..anchor).rev().map(|f| (f, Some(f + 1))).collect();
-    let mut masks = vec![GrayImage::new(width, height); frames.len()];
-    let mut regions = vec![None; frames.len()];
-    for way in [forward, backward] {
-        run.restart(small_masks.get(anchor), first);
-        for batch in way.chunks(BATCH) {
-            let maps = batch.par_iter().map(|(f, from)| run.maps(*f, *from)).collect::<Result<Vec<_>, MaskError>>()?;
-            for ((f, _), maps) in batch.iter().zip(&maps) {
-                (small_masks[*f], soft[*f]) = run.segment(*f, maps);
-                if *f == anchor && area_px(&small_masks[*f]) == 0 {
-                    return Err(MaskError::Nothing(*f));
-                }
-                if !goes_on() {
-                    return Err(MaskError::Stopped);
-                }
-            }
-            let done: Vec<(usize, Option<(GrayImage, Region)>)> =
-                batch.par_iter().map(|(f, _)| (*f, follow(&enlarge(&small_masks[*f], &soft[*f], width, height), None))).collect();
-            for (f, found) in done {
-                soft[f] = Vec::new();
-                if let Some((mask, region)) = found {
-                    (masks[f], regions[f]) =
-                        (mask, Some(Region { second_px: run.seconds[f].map(|s| (s as f64 / (scale * scale)) as usize), ..region }));
-                }
-            }
+    let mut found =
+        Silhouettes { masks: vec![GrayImage::new(width, height); frames.len()], regions: vec![None; frames.len()], path_px: Vec::new() };
+    run.both_ways(&mut found, goes_on)?;
+    for (region, second) in found.regions.iter_mut().zip(&run.seconds) {
+        if let Some(region) = region {
+            region.second_px = second.map(|s| (s as f64 / (scale * scale)) as usize);
         }
     }
-    let path_px = regions.iter().zip(&scenery.first_from_frame).map(|(region, h)| {
+    let in_scenery = |(region, h): (&Option<Region>, &Option<nalgebra::Matrix3<f64>>)| {
         let (c, h) = (region.as_ref()?.centre_px, (*h)?);
         let p = h * nalgebra::Vector3::new(c[0] * scale, c[1] * scale, 1.0);
         Some([p.x / p.z / scale, p.y / p.z / scale])
-    });
-    Ok(Silhouettes { path_px: path_px.collect(), masks, regions })
+    };
+    found.path_px = found.regions.iter().zip(&scenery.first_from_frame).map(in_scenery).collect();
+    Ok(found)
 }
 
 fn check(frames: &[RgbImage], marks: &[Mark]) -> Result<(), MaskError> {
@@ -220,8 +193,6 @@ struct Maps {
     couplings: [Vec<f32>; 4],
 }
 
-const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (0, 1), (1, 1), (-1, 1)];
-
 struct Run<'a> {
     frames: &'a [RgbImage],
     marks: &'a [Mark],
@@ -262,10 +233,45 @@ impl<'a> Run<'a> {
         Ok(Run { frames, marks, options, scenery, subject, background, trust, first, anchor, previous: None, centre: anchor, seconds })
     }
 
+    /// From the first frame with a subject's rectangle to the end, and from there to the beginning.
+    fn both_ways(&mut self, found: &mut Silhouettes, goes_on: &mut dyn FnMut() -> bool) -> Result<(), MaskError> {
+        let anchor = self.marks.iter().filter(|m| m.subject).map(|m| m.frame).min().unwrap_or(0);
+        let forward: Vec<(usize, Option<usize>)> =
+            (anchor..self.frames.len()).map(|f| (f, f.checked_sub(1).filter(|p| *p >= anchor))).collect();
+        let backward: Vec<(usize, Option<usize>)> = (0..anchor).rev().map(|f| (f, Some(f + 1))).collect();
+        let (width, height) = found.masks[anchor].dimensions();
+        let mut first = None;
+        for way in [forward, backward] {
+            self.restart(first.as_ref());
+            for batch in way.chunks(BATCH) {
+                let maps = batch.par_iter().map(|(f, from)| self.maps(*f, *from)).collect::<Result<Vec<_>, MaskError>>()?;
+                let mut small = Vec::with_capacity(batch.len());
+                for ((f, _), maps) in batch.iter().zip(&maps) {
+                    small.push(self.segment(*f, maps));
+                    if *f == anchor {
+                        first = small.last().map(|(mask, _)| mask.clone()).filter(|m| area_px(m) > 0);
+                        first.as_ref().ok_or(MaskError::Nothing(anchor))?;
+                    }
+                    if !goes_on() {
+                        return Err(MaskError::Stopped);
+                    }
+                }
+                let full: Vec<Option<(GrayImage, Region)>> =
+                    small.par_iter().map(|(mask, belief)| follow(&enlarge(mask, belief, width, height), None)).collect();
+                for ((f, _), full) in batch.iter().zip(full) {
+                    if let Some((mask, region)) = full {
+                        (found.masks[*f], found.regions[*f]) = (mask, Some(region));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// Before each of the two directions: the anchor's mask, once there is one.
-    fn restart(&mut self, anchor: Option<&GrayImage>, centre: [f64; 2]) {
-        self.previous = anchor.filter(|m| area_px(m) > 0).cloned();
-        self.centre = self.previous.as_ref().and_then(|m| follow(m, None)).map_or(centre, |(_, r)| r.centre_px);
+    fn restart(&mut self, anchor: Option<&GrayImage>) {
+        self.previous = anchor.cloned();
+        self.centre = anchor.and_then(|m| follow(m, None)).map_or(self.anchor, |(_, r)| r.centre_px);
         ([self.subject, self.background], self.trust) = self.first.clone();
     }
 
@@ -406,107 +412,6 @@ fn carried(mask: &GrayImage, flow: &[[f32; 2]], reach: f32) -> Vec<f32> {
     });
     let (inside, outside) = (distance(&moved, true), distance(&moved, false));
     inside.iter().zip(&outside).map(|(i, o)| ((i - o) / reach).clamp(-4.0, 3.0)).collect()
-}
-
-/// Chamfer distance (1, √2) of pixels to the nearest one outside (`inside`) or inside the mask; 0 on the other side.
-fn distance(mask: &GrayImage, inside: bool) -> Vec<f32> {
-    const DIAGONAL: f32 = std::f32::consts::SQRT_2;
-    let (width, height) = (mask.width() as usize, mask.height() as usize);
-    let mut d: Vec<f32> = mask.iter().map(|&p| if (p > 0) == inside { 1e6 } else { 0.0 }).collect();
-    for y in 0..height {
-        for x in 0..width {
-            let i = y * width + x;
-            let mut best = d[i];
-            if x > 0 {
-                best = best.min(d[i - 1] + 1.0)
-            }
-            if y > 0 {
-                best = best.min(d[i - width] + 1.0);
-                if x > 0 {
-                    best = best.min(d[i - width - 1] + DIAGONAL)
-                }
-                if x + 1 < width {
-                    best = best.min(d[i - width + 1] + DIAGONAL)
-                }
-            }
-            d[i] = best;
-        }
-    }
-    for y in (0..height).rev() {
-        for x in (0..width).rev() {
-            let i = y * width + x;
-            let mut best = d[i];
-            if x + 1 < width {
-                best = best.min(d[i + 1] + 1.0)
-            }
-            if y + 1 < height {
-                best = best.min(d[i + width] + 1.0);
-                if x > 0 {
-                    best = best.min(d[i + width - 1] + DIAGONAL)
-                }
-                if x + 1 < width {
-                    best = best.min(d[i + width + 1] + DIAGONAL)
-                }
-            }
-            d[i] = best;
-        }
-    }
-    d
-}
-
-/// exp(−β|Δcolour|²) over the distance of the pixels, β from the frame's mean step.
-fn couplings(lab: &[[f32; 3]], width: usize) -> [Vec<f32>; 4] {
-    let height = lab.len() / width.max(1);
-    let steps = NEIGHBOURS.map(|(dx, dy)| {
-        let step = |i: usize| {
-            let (x, y) = ((i % width) as i64 + dx, (i / width) as i64 + dy);
-            let inside = (0..width as i64).contains(&x) && (0..height as i64).contains(&y);
-            if !inside {
-                return f32::INFINITY;
-            }
-            let j = y as usize * width + x as usize;
-            (0..3).map(|k| (lab[i][k] - lab[j][k]).powi(2)).sum()
-        };
-        (0..lab.len()).map(step).collect::<Vec<f32>>()
-    });
-    let (sum, count) = steps.iter().flatten().filter(|s| s.is_finite()).fold((0.0, 0.0), |(s, n), v| (s + f64::from(*v), n + 1.0));
-    let beta = (count / (2.0 * sum + 1e-6)) as f32;
-    let mut k = 0;
-    steps.map(|s| {
-        let (dx, dy) = NEIGHBOURS[k];
-        k += 1;
-        let length = ((dx * dx + dy * dy) as f32).sqrt();
-        s.into_iter().map(|d| (-beta * d).exp() / length).collect()
-    })
-}
-
-/// Equation (2), all pixels at once.
-fn mean_field(odds: &[f32], couplings: &[Vec<f32>; 4], width: usize) -> Vec<f32> {
-    let mut belief: Vec<f32> = odds.iter().map(|u| (u / 2.0).tanh()).collect();
-    let mut next = belief.clone();
-    for _ in 0..ROUNDS {
-        next.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-            for (x, value) in row.iter_mut().enumerate() {
-                let i = y * width + x;
-                let mut sum = 0.0;
-                for (w, (dx, dy)) in couplings.iter().zip(NEIGHBOURS) {
-                    let step = dy as isize * width as isize + dx as isize;
-                    // Couplings beyond the picture are 0.
-                    if w[i] > 0.0 {
-                        sum += w[i] * belief[i.wrapping_add_signed(step)];
-                    }
-                    let back = (x as i64 - dx, y as i64 - dy);
-                    if back.0 >= 0 && back.1 >= 0 && back.0 < width as i64 {
-                        let j = back.1 as usize * width + back.0 as usize;
-                        sum += w[j] * belief[j];
-                    }
-                }
-                *value = (odds[i] / 2.0 + COUPLING * sum).tanh();
-            }
-        });
-        std::mem::swap(&mut belief, &mut next);
-    }
-    belief
 }
 
 #[cfg(test)]

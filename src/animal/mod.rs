@@ -10,6 +10,7 @@ pub mod blend;
 pub mod change;
 pub mod creature;
 pub mod eigen;
+pub mod field;
 pub mod horse;
 pub mod keys;
 pub mod masks;

@@ -171,4 +171,18 @@ mod tests {
         assert_eq!(single(&points, &[1, 14], false), Err(SwitchError::Alike));
         assert_eq!(switched(&points, &[0, 1, 2, 3, 4, 5], false), Err(SwitchError::Count(6)));
     }
+
+    #[test]
+    fn another_clip_is_driven_by_places_in_the_plane() {
+        let keys = [2, 5, 8, 12, 15, 18, 21, 25];
+        let known = walk(40, 0.0);
+        let nodes: Vec<Vec<f64>> = keys.iter().map(|k| known[*k].clone()).collect();
+        let own = single(&known, &keys[..4], false).unwrap();
+        assert_eq!(single_over(&known, &nodes[..4], false).unwrap(), own);
+        // Half a frame later, two strides.
+        let found = switched_over(&walk(52, 0.24), &nodes, false).unwrap();
+        let heaviest: Vec<usize> = found.rows.iter().map(|r| (0..8).max_by(|a, b| r[*a].total_cmp(&r[*b])).unwrap()).collect();
+        let steps: Vec<usize> = heaviest.windows(2).map(|w| (w[1] + 8 - w[0]) % 8).collect();
+        assert!(steps.iter().all(|s| *s <= 1) && (14..=17).contains(&steps.iter().sum::<usize>()), "{heaviest:?}");
+    }
 }

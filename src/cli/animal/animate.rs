@@ -158,6 +158,12 @@ pub fn write(output: &Path, a: &Animation) -> Result<()> {
     let mut creature = a.creature.clone();
     creature.motions = vec![Motion::at_rate("motion", a.fps, postures)];
     glb::write(&folder.join("motion.glb"), &creature)?;
+    let facts = serde_json::json!({
+        "fps": a.fps, "frames": in_place.len(), "up": "+y", "forward": "+z", "unit": "the template's (metres for glTF)", "keys": a.keys,
+        "travel": a.choices.travel, "rotations": "BVH: degrees, ZXY, zero = the template's rest pose with the world's axes",
+    });
+    let json = folder.join("motion.json");
+    write_atomic(&json, format!("{facts:#}\n").as_bytes()).with_context(|| format!("cannot write {}", json.display()))?;
     let csv = folder.join("weights.csv");
     write_atomic(&csv, weights_csv(a).as_bytes()).with_context(|| format!("cannot write {}", csv.display()))?;
     save(&folder.join("weights.png"), &weights_picture(&a.weights.rows, &a.keys, a.fps)?)?;
