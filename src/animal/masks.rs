@@ -9,7 +9,8 @@
 //!       down to a quarter where the flow leads to another colour, by 10 to 30 grey levels)         (1)
 //! In the frame of the rectangles the last term falls off with the distance from the subject's rectangle. Mean-field
 //! inference of a Potts model whose couplings fall with the colour step ([`super::field`]) smooths U along edges.
-//! Both mixtures are learnt anew every 5 frames, the animal's from the mask's inside, the scenery's from round it.
+//! Both mixtures are learnt anew every 5 frames, the animal's from the mask's inside, the scenery's from round it, unless
+//! they would confuse 30 % of their own samples: where animal and scenery share a colour, learning from masks runs away.
 //! Departure from Favreau et al. (2004): they classify by colour alone. Change and carrying make animals of the colour of
 //! their surroundings possible. Fails when animal and scenery agree in colour and the animal stands still.
 //! Checked against rendered clips whose silhouettes are known, and hand-made masks of real clips.
@@ -225,7 +226,7 @@ impl<'a> Run<'a> {
         let (inside, outside) = (colours(true)?, colours(false)?);
         let fit = |colours: &[[f32; 3]], name| Mixture::fit(colours, GAUSSIANS, 1).ok_or(MaskError::NoColours(name));
         let (subject, background) = (fit(&inside, "subject")?, fit(&outside, "background")?);
-        let trust = trust(&subject, &background, &inside, &outside);
+        let trust = trust(confusion(&subject, &background, &inside, &outside));
         let middle = marks.iter().filter(|m| m.subject).min_by_key(|m| m.frame).map(|m| m.rectangle);
         let anchor = middle.map_or([0.0; 2], |r| [f64::from(r.x) + f64::from(r.width) / 2.0, f64::from(r.y) + f64::from(r.height) / 2.0]);
         let first = ([subject.clone(), background.clone()], trust);
@@ -361,8 +362,10 @@ impl<'a> Run<'a> {
         let inside = if inside.len() > 50 { inside } else { colours(&|i| mask.as_raw()[i] > 0) };
         let round = colours(&|i| far.as_raw()[i] > 0 && near.as_raw()[i] == 0);
         if let (Some(subject), Some(background)) = (Mixture::fit(&inside, GAUSSIANS, 1), Mixture::fit(&round, GAUSSIANS, 1)) {
-            self.trust = trust(&subject, &background, &inside, &round);
-            (self.subject, self.background) = (subject, background);
+            let confused = confusion(&subject, &background, &inside, &round);
+            if confused < CONFUSED {
+                (self.subject, self.background, self.trust) = (subject, background, trust(confused));
+            }
         }
     }
 }
@@ -378,15 +381,22 @@ fn reach_px(picture: &GrayImage, px: f32) -> f32 {
     (px * picture.width().max(picture.height()) as f32 / WORKING_PX as f32).max(2.0)
 }
 
-/// w of equation (1), by the share of their own samples that the mixtures confuse.
-fn trust(subject: &Mixture, background: &Mixture, inside: &[[f32; 3]], outside: &[[f32; 3]]) -> f32 {
+/// Mixtures that confuse more of their own samples than this know nothing, and are not learnt.
+const CONFUSED: f32 = 0.3;
+
+/// w of equation (1).
+fn trust(confused: f32) -> f32 {
+    2.0 - 1.4 * (confused / 0.05).min(1.0)
+}
+
+/// The share of their own samples that the mixtures take for the other's, the worse of both.
+fn confusion(subject: &Mixture, background: &Mixture, inside: &[[f32; 3]], outside: &[[f32; 3]]) -> f32 {
     let confused = |samples: &[[f32; 3]], own: &Mixture, other: &Mixture| {
         let step = (samples.len() / 1000).max(1);
         let seen: Vec<bool> = samples.iter().step_by(step).map(|x| other.log_density(*x) > own.log_density(*x)).collect();
         seen.iter().filter(|c| **c).count() as f32 / seen.len().max(1) as f32
     };
-    let worst = confused(inside, subject, background).max(confused(outside, background, subject));
-    2.0 - 1.4 * (worst / 0.05).min(1.0)
+    confused(inside, subject, background).max(confused(outside, background, subject))
 }
 
 /// 1 where the flow leads to the same colour, down to 1/4 where it does not.
@@ -431,24 +441,32 @@ mod tests {
         body || leg(-16.0, slope) || leg(15.0, -slope)
     }
 
-    const NEAR: [f64; 3] = [156.0, 124.0, 72.0];
-    const SAME: [f64; 3] = [167.0, 121.0, 63.0];
+    /// Colours of a meadow and of its stones, and how rough both are, grey levels.
+    struct Ground {
+        meadow: [f64; 3],
+        stones: [f64; 3],
+        rough: f64,
+    }
 
-    /// An ochre animal on a meadow with stones of nearly or quite its colour; the truth.
-    fn clip(n: usize, stones: [f64; 3]) -> (Vec<RgbImage>, Vec<GrayImage>) {
+    /// Stones of nearly the animal's colour; rough sand of its colour.
+    const NEAR: Ground = Ground { meadow: [90.0, 140.0, 70.0], stones: [156.0, 124.0, 72.0], rough: 18.0 };
+    const SAND: Ground = Ground { meadow: [165.0, 122.0, 66.0], stones: [160.0, 124.0, 70.0], rough: 40.0 };
+
+    /// A smooth ochre animal on some ground; the truth.
+    fn clip(n: usize, ground: &Ground) -> (Vec<RgbImage>, Vec<GrayImage>) {
         let mut random = ChaCha8Rng::seed_from_u64(8);
         // Blades and sand stay, the camera's noise does not.
-        let texture: Vec<f64> = (0..SIZE.0 * SIZE.1).map(|_| 18.0 * (random.random::<f64>() - 0.5)).collect();
+        let texture: Vec<f64> = (0..SIZE.0 * SIZE.1).map(|_| ground.rough * (random.random::<f64>() - 0.5)).collect();
         let mut pixel = |t: usize, x: u32, y: u32| {
-            let ground = if inside(t, x, y) { 0.0 } else { texture[(y * SIZE.0 + x) as usize] };
-            let grain = ground + 6.0 * (random.random::<f64>() - 0.5);
+            let rough = if inside(t, x, y) { 0.0 } else { texture[(y * SIZE.0 + x) as usize] };
+            let grain = rough + 6.0 * (random.random::<f64>() - 0.5);
             let stone = (x / 23 + y / 31).is_multiple_of(3);
             let base = if inside(t, x, y) {
                 [170.0, 120.0, 60.0]
             } else if stone {
-                stones
+                ground.stones
             } else {
-                [90.0, 140.0, 70.0]
+                ground.meadow
             };
             Rgb(base.map(|v: f64| (v + grain).clamp(0.0, 255.0) as u8))
         };
@@ -468,20 +486,21 @@ mod tests {
         both as f64 / either as f64
     }
 
-    fn score(options: &MaskOptions, marks: &[Mark], stones: [f64; 3]) -> f64 {
-        let (frames, truth) = clip(24, stones);
+    fn score(options: &MaskOptions, marks: &[Mark], ground: &Ground) -> f64 {
+        let (frames, truth) = clip(24, ground);
         let found = silhouettes(&frames, marks, options, &mut || true).unwrap();
         found.masks.iter().zip(&truth).map(|(m, t)| iou(m, t)).sum::<f64>() / 24.0
     }
 
     #[test]
-    fn a_walker_among_stones_of_its_colour_is_found() {
-        let near = score(&MaskOptions::default(), &marks(), NEAR);
-        let same = score(&MaskOptions::default(), &marks(), SAME);
-        let still = score(&MaskOptions { motion: false, ..MaskOptions::default() }, &marks(), SAME);
-        let rough = score(&MaskOptions { smooth: false, ..MaskOptions::default() }, &marks(), SAME);
-        println!("near its colour {near:.3}; its colour {same:.3}, without motion {still:.3}, without smoothing {rough:.3}");
-        assert!(near > 0.97 && same > 0.65 && same > rough + 0.02 && same > still, "{near} {same} {still} {rough}");
+    fn a_walker_on_ground_of_its_colour_is_found() {
+        let full = MaskOptions::default();
+        let near = score(&full, &marks(), &NEAR);
+        let sand = score(&full, &marks(), &SAND);
+        let still = score(&MaskOptions { motion: false, ..full.clone() }, &marks(), &SAND);
+        let rough = score(&MaskOptions { smooth: false, ..full.clone() }, &marks(), &SAND);
+        println!("stones {near:.3}; sand {sand:.3}, without motion {still:.3}, without smoothing {rough:.3}");
+        assert!(near > 0.97 && sand > 0.85 && sand > still + 0.1 && sand > rough + 0.02, "{near} {sand} {still} {rough}");
     }
 
     #[test]
@@ -491,13 +510,13 @@ mod tests {
             .map(|m| Mark { frame: 10, rectangle: Rectangle { x: m.rectangle.x + 30 * u32::from(m.subject), ..m.rectangle }, ..m })
             .filter(|m| m.subject || m.rectangle.x == 0)
             .collect();
-        let found = score(&MaskOptions::default(), &shifted, NEAR);
+        let found = score(&MaskOptions::default(), &shifted, &NEAR);
         assert!(found > 0.95, "{found}");
     }
 
     #[test]
     fn wrong_rectangles_are_errors_and_one_frame_is_enough() {
-        let (frames, truth) = clip(1, NEAR);
+        let (frames, truth) = clip(1, &NEAR);
         let run = |marks: &[Mark]| silhouettes(&frames, marks, &MaskOptions::default(), &mut || true);
         let one = run(&marks()).unwrap();
         assert!(iou(&one.masks[0], &truth[0]) > 0.8);
