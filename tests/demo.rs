@@ -42,7 +42,7 @@ fn the_whole_job_ends_near_the_truth_and_does_not_depend_on_threads() {
     let output = folder.path().join("demo");
     let (done, table, progress) = demo(&output, "2");
     assert!(done, "{progress}");
-    assert!(table.contains("seconds per stage") && table.contains("pictures/overlay.png") && progress.contains("fit: done in"));
+    assert!(table.contains("seconds per stage") && table.contains("pictures/overlay_cam_00.png") && progress.contains("fit: done in"));
 
     let csv = std::fs::read_to_string(output.join("errors.csv")).unwrap();
     let (values, beside) = errors(&csv);

@@ -209,9 +209,7 @@ pub fn fit(
     step(0.4)?;
     let last = Stage { free: SHAPED, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
-    step(0.5)?;
-    state = run.stage(state, &dense, &ten, &Stage { refreshes: 6, ..last });
-    step(0.6)?;
+    step(0.55)?;
     let curve = Curve::new(model, options.components);
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &dense, &curve, &last);
