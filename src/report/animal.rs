@@ -76,16 +76,16 @@ pub fn spectrum(eigen: &Eigenimages, rhythm: &Rhythm, fps: f64) -> Result<RgbIma
         top = amplitude.iter().copied().fold(top, f64::max);
         let points = amplitude.iter().enumerate().map(|(i, a)| [i as f64 * fps / n, *a]).collect();
         let r = rhythm.correlations.get(k).map_or_else(String::new, |r| format!(" (r = {r:.2})"));
-        series.push(Curve { label: format!("PC{}{r}", k + 1), points, dashed: false, colour: k });
+        series.push(Curve { label: format!("PC{}{r}", k + 1), points, dashed: false, colour: k, band: Vec::new() });
     }
     if let Some(peak) = &rhythm.peak {
         let height = series[0].points.iter().map(|p| p[1]).fold(0.0, f64::max);
         let grid = (0..=400).map(|i| i as f64 / 400.0 * n / 2.0);
         let points = grid.map(|bin| [bin * fps / n, height * peak.at(bin)]).collect();
-        series.push(Curve { label: "peak".into(), points, dashed: true, colour: 6 });
+        series.push(Curve { label: "peak".into(), points, dashed: true, colour: 6, band: Vec::new() });
         let [low, high] = peak.band.map(|b| b * fps / n);
         let points = vec![[low, 0.0], [low, 1.03 * top], [high, 1.03 * top], [high, 0.0]];
-        series.push(Curve { label: "band".into(), points, dashed: true, colour: 5 });
+        series.push(Curve { label: "band".into(), points, dashed: true, colour: 5, band: Vec::new() });
     }
     let title = match rhythm.period_frames {
         Some(period) => format!("spectrum: {:.2} Hz, a silhouette every {period:.1} frames, {}", fps / period, rhythm.verdict.words()),
@@ -98,12 +98,12 @@ pub fn spectrum(eigen: &Eigenimages, rhythm: &Rhythm, fps: f64) -> Result<RgbIma
 pub fn coefficients(eigen: &Eigenimages, filtered: Option<&[Vec<f64>]>, fps: f64) -> Result<RgbImage, ReportError> {
     let time = |values: Vec<f64>| values.into_iter().enumerate().map(|(t, v)| [t as f64 / fps, v]).collect();
     let mut series: Vec<Curve> = (0..2.min(eigen.coefficients.ncols()))
-        .map(|k| Curve { label: format!("PC{}", k + 1), points: time(eigen.series(k)), dashed: false, colour: k })
+        .map(|k| Curve { label: format!("PC{}", k + 1), points: time(eigen.series(k)), dashed: false, colour: k, band: Vec::new() })
         .collect();
     if let Some(points) = filtered {
         for k in 0..series.len() {
             let values = points.iter().filter_map(|p| p.get(k).copied()).collect();
-            series.push(Curve { label: format!("PC{} filtered", k + 1), points: time(values), dashed: true, colour: k });
+            series.push(Curve { label: format!("PC{} filtered", k + 1), points: time(values), dashed: true, colour: k, band: Vec::new() });
         }
     }
     curves("coefficients of the silhouettes", "time (s)", "standard deviations", &series)
@@ -117,9 +117,15 @@ pub fn weights(rows: &[Vec<f64>], keys: &[usize], fps: f64) -> Result<RgbImage, 
     let mut series: Vec<Curve> = keys
         .iter()
         .enumerate()
-        .map(|(k, frame)| Curve { label: format!("{frame}"), points: over_time(&|r| r[k]), dashed: k >= half, colour: k % half.max(1) })
+        .map(|(k, frame)| Curve {
+            label: format!("{frame}"),
+            points: over_time(&|r| r[k]),
+            dashed: k >= half,
+            colour: k % half.max(1),
+            band: Vec::new(),
+        })
         .collect();
-    series.push(Curve { label: "sum".into(), points: over_time(&|r| r.iter().sum()), dashed: true, colour: 6 });
+    series.push(Curve { label: "sum".into(), points: over_time(&|r| r.iter().sum()), dashed: true, colour: 6, band: Vec::new() });
     curves("weights of the key poses, by the keys' frames", "time (s)", "weight", &series)
 }
 
