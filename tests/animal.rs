@@ -338,3 +338,40 @@ fn bad_clips_end_with_one_sentence() {
     assert!(done && notices.contains("second region"), "{notices}");
     assert!(refused(&["animal", "keys", &at("two"), "-o", &at("k")]).contains("analysis.json"));
 }
+
+/// Mean intersection over union with the hand-made masks of a clip; rectangles from the first true mask, as a user would draw.
+fn real_clip(name: &str, more: &[&str]) -> Option<f64> {
+    let clip = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/animal/clips/davis").join(name);
+    let Ok(entries) = clip.join("masks").read_dir() else {
+        println!("skipped: no {}", clip.display());
+        return None;
+    };
+    let mut truths: Vec<PathBuf> = entries.map(|e| e.unwrap().path()).collect();
+    truths.sort();
+    let truth = |path: &PathBuf| image::open(path).unwrap().into_luma8();
+    let first = truth(&truths[0]);
+    let on: Vec<(u32, u32)> = first.enumerate_pixels().filter(|(_, _, p)| p.0[0] > 0).map(|(x, y, _)| (x, y)).collect();
+    let range = |k: fn(&(u32, u32)) -> u32| (on.iter().map(k).min().unwrap(), on.iter().map(k).max().unwrap());
+    let ((x0, x1), (y0, y1)) = (range(|p| p.0), range(|p| p.1));
+    let (width, height) = first.dimensions();
+    let inner = format!("{},{},{},{}", x0 + (x1 - x0) / 5, y0 + (y1 - y0) / 5, (x1 - x0) * 3 / 5, (y1 - y0) * 2 / 5);
+    let beside =
+        [format!("0,0,{},{height}", x0 - 4), format!("{},0,{},{height}", x1 + 4, width - x1 - 4), format!("0,0,{width},{}", y0 - 4)];
+    let dir = tempfile::tempdir().unwrap();
+    let (images, out) = (clip.join("images"), dir.path().join("masks"));
+    let mut command = vec!["animal", "masks", images.to_str().unwrap(), "--subject", &inner, "-o", out.to_str().unwrap()];
+    beside.iter().for_each(|b| command.extend(["--background", b]));
+    fine(&[&command[..], more].concat());
+    let scores =
+        truths.iter().enumerate().map(|(t, path)| iou(&truth(path), &image::open(out.join(format!("{t:06}.png"))).unwrap().into_luma8()));
+    Some(scores.sum::<f64>() / truths.len() as f64)
+}
+
+#[test]
+fn real_animals_before_a_following_camera_are_found() {
+    for (name, still_at_most) in [("camel", 0.7), ("lucia", 1.0)] {
+        let (Some(found), Some(still)) = (real_clip(name, &[]), real_clip(name, &["--motion", "off"])) else { continue };
+        println!("{name}: IoU {found:.3}, without motion {still:.3}");
+        assert!(found > 0.8 && still < still_at_most, "{name}: {found} {still}");
+    }
+}

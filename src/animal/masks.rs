@@ -9,8 +9,8 @@
 //!       down to a quarter where the flow leads to another colour, by 10 to 30 grey levels)         (1)
 //! In the frame of the rectangles the last term falls off with the distance from the subject's rectangle. Mean-field
 //! inference of a Potts model whose couplings fall with the colour step ([`super::field`]) smooths U along edges.
-//! Both mixtures are learnt anew every 5 frames, the animal's from the mask's inside, the scenery's from round it, unless
-//! they would confuse 30 % of their own samples: where animal and scenery share a colour, learning from masks runs away.
+//! Both mixtures are learnt anew every 5 frames, the animal's from the mask's inside, the scenery's from round it; where
+//! animal and scenery share a colour, that can run away, and the rectangles' colours are better kept.
 //! Departure from Favreau et al. (2004): they classify by colour alone. Change and carrying make animals of the colour of
 //! their surroundings possible. Fails when animal and scenery agree in colour and the animal stands still.
 //! Checked against rendered clips whose silhouettes are known, and hand-made masks of real clips.
@@ -362,10 +362,8 @@ impl<'a> Run<'a> {
         let inside = if inside.len() > 50 { inside } else { colours(&|i| mask.as_raw()[i] > 0) };
         let round = colours(&|i| far.as_raw()[i] > 0 && near.as_raw()[i] == 0);
         if let (Some(subject), Some(background)) = (Mixture::fit(&inside, GAUSSIANS, 1), Mixture::fit(&round, GAUSSIANS, 1)) {
-            let confused = confusion(&subject, &background, &inside, &round);
-            if confused < CONFUSED {
-                (self.subject, self.background, self.trust) = (subject, background, trust(confused));
-            }
+            self.trust = trust(confusion(&subject, &background, &inside, &round));
+            (self.subject, self.background) = (subject, background);
         }
     }
 }
@@ -380,9 +378,6 @@ fn noise(change: &[f32]) -> f32 {
 fn reach_px(picture: &GrayImage, px: f32) -> f32 {
     (px * picture.width().max(picture.height()) as f32 / WORKING_PX as f32).max(2.0)
 }
-
-/// Mixtures that confuse more of their own samples than this know nothing, and are not learnt.
-const CONFUSED: f32 = 0.3;
 
 /// w of equation (1).
 fn trust(confused: f32) -> f32 {
@@ -448,8 +443,9 @@ mod tests {
         rough: f64,
     }
 
-    /// Stones of nearly the animal's colour; rough sand of its colour.
+    /// Stones of nearly the animal's colour, stones of its colour, rough sand of its colour.
     const NEAR: Ground = Ground { meadow: [90.0, 140.0, 70.0], stones: [156.0, 124.0, 72.0], rough: 18.0 };
+    const SAME: Ground = Ground { meadow: [90.0, 140.0, 70.0], stones: [167.0, 121.0, 63.0], rough: 18.0 };
     const SAND: Ground = Ground { meadow: [165.0, 122.0, 66.0], stones: [160.0, 124.0, 70.0], rough: 40.0 };
 
     /// A smooth ochre animal on some ground; the truth.
@@ -495,12 +491,15 @@ mod tests {
     #[test]
     fn a_walker_on_ground_of_its_colour_is_found() {
         let full = MaskOptions::default();
+        let kept = MaskOptions { update_every: 0, ..full.clone() };
         let near = score(&full, &marks(), &NEAR);
-        let sand = score(&full, &marks(), &SAND);
-        let still = score(&MaskOptions { motion: false, ..full.clone() }, &marks(), &SAND);
-        let rough = score(&MaskOptions { smooth: false, ..full.clone() }, &marks(), &SAND);
-        println!("stones {near:.3}; sand {sand:.3}, without motion {still:.3}, without smoothing {rough:.3}");
-        assert!(near > 0.97 && sand > 0.85 && sand > still + 0.1 && sand > rough + 0.02, "{near} {sand} {still} {rough}");
+        let same = score(&full, &marks(), &SAME);
+        let rough = score(&MaskOptions { smooth: false, ..full.clone() }, &marks(), &SAME);
+        let [sand, learnt] = [&kept, &full].map(|options| score(options, &marks(), &SAND));
+        println!("near {near:.3}; same {same:.3}, without smoothing {rough:.3}; sand {sand:.3}, its colours learnt anew {learnt:.3}");
+        assert!(near > 0.97 && same > 0.65 && same > rough + 0.1, "{near} {same} {rough}");
+        // Learning from masks runs away here.
+        assert!(sand > 0.85 && sand > learnt + 0.2, "{sand} {learnt}");
     }
 
     #[test]
