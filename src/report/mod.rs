@@ -10,6 +10,7 @@ use image::{DynamicImage, ImageFormat, RgbImage};
 use crate::footage::board::BoardError;
 use crate::io::write_atomic;
 
+pub mod animal;
 pub mod board;
 pub mod calibration;
 pub mod canvas;
