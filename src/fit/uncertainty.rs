@@ -10,6 +10,7 @@
 //!   Σ = (Σ_kinds s Jᵀ W J + P)⁻¹.                                                                               (2)
 //! Of the inverse only the blocks of one frame and of the shared unknowns are formed (selected inversion), so time and
 //! memory are linear in the number of frames. A joint at x moves by J δ, hence its covariance is J Σ Jᵀ.
+//! A misfit that stays with a limb goes into its width: the width's variance gets (misfit / radius)² besides.
 //! What is not in it: joint centres of another convention, and motions that differ from all subjects of the database.
 //! Checked against the dense inverse, and by the coverage of its intervals over repeated noise.
 
@@ -20,7 +21,8 @@ use super::curve::Curve;
 use super::problem::{Frame, Free, Known, Problem, Settings};
 use super::state::{LOCAL, Motion, State};
 use super::weighing::Frozen;
-use crate::body::{NODES, Surface};
+use crate::body::surface::SKIN;
+use crate::body::{Length, NODES, Surface};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::order::quantile;
 
@@ -60,7 +62,11 @@ pub fn uncertainty(curve: &Curve, frames: &[Frame], settings: &Settings, free: F
     };
     let measured = Settings { point_weight: shares[0], ray_weight: shares[1], ..believed };
     let normal = Problem::new(curve, frames, &measured, free, known, state).linearise(state);
-    let (shared, frames) = propagate(&normal, curve, state)?;
+    let (mut shared, frames) = propagate(&normal, curve, state)?;
+    for (i, sigma) in width_misfits(&Surface::new(&state.shape), misfit_m).into_iter().enumerate().filter(|_| free.widths) {
+        let at = state.layout().stature() + 1 + Length::COUNT + i;
+        shared[(at, at)] += sigma * sigma;
+    }
     Some(Uncertainty { shared, frames, shares, misfit_m })
 }
 
@@ -70,6 +76,18 @@ fn misfit_m(problem: &Problem) -> f64 {
     let median = |values: Vec<f64>| quantile(values, 0.5).unwrap_or(0.0);
     let spread = 1.4826 * median(points().map(|f| f.distance_m.abs()).collect());
     (spread * spread - median(points().map(|f| f.variance).collect())).max(0.0).sqrt().max(LEAST_MISFIT_M)
+}
+
+/// What a limb's width factor errs by when its skin is off by `misfit_m` in all frames alike: no number of frames averages
+/// that out, and the width takes up all of it.
+fn width_misfits(surface: &Surface, misfit_m: f64) -> [f64; Length::COUNT] {
+    let (mut radii_m, mut counts) = ([0.0; Length::COUNT], [0.0; Length::COUNT]);
+    for p in &surface.primitives {
+        let across = p.semi_axes.product() / p.semi_axes[p.axis];
+        radii_m[p.limb as usize] += (SKIN * across).sqrt();
+        counts[p.limb as usize] += 1.0;
+    }
+    std::array::from_fn(|i| if counts[i] > 0.0 { misfit_m * counts[i] / radii_m[i] } else { 0.0 })
 }
 
 /// Equation (1) over frames of residuals.
@@ -158,6 +176,18 @@ mod tests {
                 assert!((numeric - jacobian.column(column)).norm() < 1e-6 * (1.0 + numeric.norm()), "{node} {column}");
             }
         }
+    }
+
+    #[test]
+    fn width_takes_up_the_misfit_of_the_skin() {
+        let shape = crate::body::Shape::template(1.75);
+        let surface = Surface::new(&shape);
+        let found = width_misfits(&surface, 0.002);
+        // 2 mm on a thigh of about 7 cm and a forearm of about 4 cm radius.
+        let (thigh, forearm) = (found[Length::Thigh as usize], found[Length::Forearm as usize]);
+        assert!((0.02..0.045).contains(&thigh) && (0.035..0.08).contains(&forearm), "{thigh} {forearm}");
+        let wider = Surface::new(&crate::body::Shape { widths: [2.0; Length::COUNT], ..shape });
+        assert!((width_misfits(&wider, 0.002)[Length::Thigh as usize] * 2.0 / thigh - 1.0).abs() < 0.01);
     }
 
     #[test]
