@@ -135,7 +135,7 @@ impl<'a> Problem<'a> {
     }
 
     /// The residuals of each frame as frozen.
-    pub(super) fn frozen(&self) -> &[Vec<Frozen>] {
+    pub fn frozen(&self) -> &[Vec<Frozen>] {
         &self.frozen
     }
 
