@@ -164,9 +164,11 @@ fn compare(one: &rayon::ThreadPool, curve: &Curve, truth: &State) {
         if times.iter().sum::<f64>() < ours.iter().sum::<f64>() {
             ours = times;
         }
-        for (solver, least, cost) in peer.iter().flat_map(|_| &mut theirs) {
-            let (seconds, final_cost) = run_peer(peer.as_deref(), &file, solver, summary.initial_cost);
-            (*least, *cost) = (least.min(seconds), final_cost);
+        if let Some(program) = &peer {
+            for (solver, least, cost) in &mut theirs {
+                let (seconds, final_cost) = run_peer(program, &file, solver, summary.initial_cost);
+                (*least, *cost) = (least.min(seconds), final_cost);
+            }
         }
     }
     let total: f64 = ours.iter().sum();
@@ -197,8 +199,8 @@ fn build_peer() -> Option<PathBuf> {
 }
 
 /// Seconds per iteration and final cost of Ceres, which must begin at our cost.
-fn run_peer(program: Option<&Path>, file: &Path, solver: &str, initial_cost: f64) -> (f64, f64) {
-    let output = Command::new(program.expect("the peer was built")).arg(file).arg(solver).output().expect("the peer runs");
+fn run_peer(program: &Path, file: &Path, solver: &str, initial_cost: f64) -> (f64, f64) {
+    let output = Command::new(program).arg(file).arg(solver).output().expect("the peer runs");
     let text = String::from_utf8_lossy(&output.stdout);
     let number = |key: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix(key)).and_then(|rest| rest.trim().parse::<f64>().ok());

@@ -120,6 +120,8 @@ pub struct Problem<'a> {
 
 /// Precision of the floor times the share of new information per primitive: 15 mm, 0.3.
 const SUNKEN_WEIGHT: f64 = 0.3 / (0.015 * 0.015);
+/// Frames whose normal equations are held at the same time; bounds the memory of long sequences.
+const AT_ONCE: usize = 64;
 
 impl<'a> Problem<'a> {
     pub fn new(curve: &'a Curve, frames: &'a [Frame], settings: &'a Settings, free: Free, known: &'a Known, state: &State) -> Problem<'a> {
@@ -208,7 +210,12 @@ impl<'a> Problem<'a> {
                 gathered.add(residual, SUNKEN_WEIGHT, 1.0, &mut scratch.pull);
             }
         }
-        gathered.expand(&motion, state.layout())
+        gathered.expand(&motion, state.layout(), self.moving(state.layout()))
+    }
+
+    /// How many of the unknowns can move a frame: the posture, last of them, is often pinned.
+    fn moving(&self, layout: Layout) -> usize {
+        if self.free.posture { layout.size() } else { layout.local + layout.posture(0) }
     }
 
     /// The silhouettes of a frame with their frozen quantities, one per primitive.
@@ -398,11 +405,13 @@ impl ArrowProblem for Problem<'_> {
 
     fn linearise(&self, state: &State) -> NormalEquations {
         let surface = Surface::new(&state.shape);
-        let frames: Vec<FrameNormal> = (0..self.frames.len()).into_par_iter().map(|t| self.frame_normal(state, &surface, t)).collect();
         let layout = state.layout();
-        let mut normal = NormalEquations::zeros(layout.local * frames.len(), 3 * layout.local - 1, layout.shared());
-        for (t, frame) in frames.iter().enumerate() {
-            frame.scatter(t, layout.local, &mut normal);
+        let count = self.frames.len();
+        let mut normal = NormalEquations::zeros(layout.local * count, 3 * layout.local - 1, layout.shared());
+        for first in (0..count).step_by(AT_ONCE) {
+            let some = first..count.min(first + AT_ONCE);
+            let frames: Vec<FrameNormal> = some.into_par_iter().map(|t| self.frame_normal(state, &surface, t)).collect();
+            frames.iter().zip(first..).for_each(|(frame, t)| frame.scatter(t, layout.local, &mut normal));
         }
         for (i, r, slope) in self.shared_priors(state) {
             normal.cost += 0.5 * r * r;
@@ -543,7 +552,7 @@ pub(super) mod tests {
             let factor = Problem::residual(&motion, &state, 1, frozen, &mut scratch).1;
             let mut gathered = Gathered::new();
             gathered.add(1.0, 1.0, factor, &mut scratch.pull);
-            let row = gathered.expand(&motion, layout).gradient;
+            let row = gathered.expand(&motion, layout, layout.size()).gradient;
             for (i, analytic) in row.iter().enumerate() {
                 let at = |h: f64| {
                     let (mut y, mut z) = (vec![0.0; 3 * layout.local], vec![0.0; layout.shared()]);

@@ -105,9 +105,24 @@ impl Gathered {
         }
     }
 
-    /// The same over the unknowns: Tᵀ M T.
-    pub fn expand(&self, motion: &Motion, layout: Layout) -> FrameNormal {
-        let size = layout.size();
+    /// The same over the first `size` unknowns: Tᵀ M T.
+    pub fn expand(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.expand_avx2(motion, layout, size) };
+        }
+        self.expand_with(motion, layout, size)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn expand_avx2(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
+        self.expand_with(motion, layout, size)
+    }
+
+    #[inline(always)]
+    fn expand_with(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
         let first_size = layout.local + layout.stature();
         let mut normal = FrameNormal { cost: self.cost, hessian: vec![0.0; size * size], gradient: vec![0.0; size] };
         let mut product = vec![0.0; 6 * size];
@@ -115,15 +130,19 @@ impl Gathered {
         for (i, twist) in motion.twists.iter().enumerate().filter(|(i, _)| met(*i, *i)) {
             product.fill(0.0);
             for (j, other) in motion.twists.iter().enumerate().filter(|(j, _)| met(i, *j)) {
-                self.times(i, j, other, size, &mut product);
+                for (r, row) in product.chunks_exact_mut(size).enumerate() {
+                    add_six(row, &self.block_row(i, j, r), std::array::from_fn(|c| &other.row(c)[..size]));
+                }
             }
-            for r in 0..6 {
-                let sizes = &mut product[r * size + first_size..][..SIZES];
-                sizes.iter_mut().enumerate().for_each(|(d, p)| *p += self.hessian[(6 * NODES + d) * WIDTH + 6 * i + r]);
-                let row = twist.row(r);
-                add_scaled(&mut normal.gradient, self.gradient[6 * i + r], row);
-                for (a, t) in row.iter().enumerate().filter(|(_, t)| **t != 0.0) {
-                    add_scaled(&mut normal.hessian[a * size..=a * size + a], *t, &product[r * size..]);
+            for (r, row) in product.chunks_exact_mut(size).enumerate() {
+                let pairs = (0..SIZES).map(|d| self.hessian[(6 * NODES + d) * WIDTH + 6 * i + r]);
+                row[first_size..].iter_mut().zip(pairs).for_each(|(p, pair)| *p += pair);
+                add_scaled(&mut normal.gradient, self.gradient[6 * i + r], twist.row(r));
+            }
+            for (a, row) in normal.hessian.chunks_exact_mut(size).enumerate() {
+                let factors: [f64; 6] = std::array::from_fn(|r| twist.row(r)[a]);
+                if factors != [0.0; 6] {
+                    add_six(&mut row[..=a], &factors, std::array::from_fn(|r| &product[r * size..=r * size + a]));
                 }
             }
         }
@@ -132,11 +151,9 @@ impl Gathered {
             normal.gradient[a] += self.gradient[from];
             let row = &mut normal.hessian[a * size..=a * size + a];
             for (j, twist) in motion.twists.iter().enumerate() {
-                for r in 0..6 {
-                    let pair = self.hessian[from * WIDTH + 6 * j + r];
-                    if pair != 0.0 {
-                        add_scaled(row, pair, twist.row(r));
-                    }
+                let pairs: [f64; 6] = std::array::from_fn(|r| self.hessian[from * WIDTH + 6 * j + r]);
+                if pairs != [0.0; 6] {
+                    add_six(row, &pairs, std::array::from_fn(|r| &twist.row(r)[..=a]));
                 }
             }
             let sizes = &self.hessian[from * WIDTH + 6 * NODES..];
@@ -145,20 +162,26 @@ impl Gathered {
         normal
     }
 
-    /// Adds block (i, j) of M times the twist of j.
-    fn times(&self, i: usize, j: usize, twist: &Twist, size: usize, product: &mut [f64]) {
-        for r in 0..6 {
-            for c in 0..6 {
-                let at = if i >= j { (6 * i + r) * WIDTH + 6 * j + c } else { (6 * j + c) * WIDTH + 6 * i + r };
-                add_scaled(&mut product[r * size..][..size], self.hessian[at], twist.row(c));
-            }
-        }
+    /// Row `r` of block (i, j) of M.
+    fn block_row(&self, i: usize, j: usize, r: usize) -> [f64; 6] {
+        let at = |c: usize| if i >= j { (6 * i + r) * WIDTH + 6 * j + c } else { (6 * j + c) * WIDTH + 6 * i + r };
+        std::array::from_fn(|c| self.hessian[at(c)])
     }
 }
 
 /// sum += factor · row, as far as `sum` goes.
+#[inline(always)]
 fn add_scaled(sum: &mut [f64], factor: f64, row: &[f64]) {
     sum.iter_mut().zip(row).for_each(|(s, v)| *s += factor * v);
+}
+
+/// The same of six rows as long as `sum`, one after the other.
+#[inline(always)]
+fn add_six(sum: &mut [f64], factors: &[f64; 6], rows: [&[f64]; 6]) {
+    let rows = rows.map(|row| &row[..sum.len()]);
+    for (i, s) in sum.iter_mut().enumerate() {
+        *s = (0..6).fold(*s, |s, r| s + factors[r] * rows[r][i]);
+    }
 }
 
 /// Normal equations of one frame over its own and the shared unknowns.
@@ -237,7 +260,7 @@ mod tests {
                 (0..size).for_each(|b| expected[a * size + b] += weight * row[a] * row[b]);
             }
         }
-        let found = gathered.expand(&motion, layout);
+        let found = gathered.expand(&motion, layout, size);
         let largest = expected.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         for a in 0..size {
             assert!((found.gradient[a] - gradient[a]).abs() < 1e-11 * largest, "{a}");
