@@ -128,10 +128,10 @@ fn normal(rng: &mut ChaCha8Rng) -> Vector3<f64> {
     Vector3::new(one(), one(), one())
 }
 
-/// Median seconds to linearise, to solve and to judge a step, over the first iterations from `start`.
+/// Least seconds to linearise, to solve and to judge a step, over the first iterations from `start`: others may use the machine.
 fn iteration_s(problem: &Problem, start: &State) -> [f64; 3] {
     let mut state = start.clone();
-    let mut parts = [const { Vec::new() }; 3];
+    let mut least = [f64::INFINITY; 3];
     for _ in 0..ITERATIONS {
         let began = Instant::now();
         let normal = problem.linearise(&state);
@@ -141,12 +141,9 @@ fn iteration_s(problem: &Problem, start: &State) -> [f64; 3] {
         state = problem.retract(&state, &y, &z);
         std::hint::black_box(problem.cost(&state));
         let seconds = [linearised - began, stepped - linearised, stepped.elapsed()];
-        parts.iter_mut().zip(seconds).for_each(|(part, s)| part.push(s.as_secs_f64()));
+        least.iter_mut().zip(seconds).for_each(|(least, s)| *least = least.min(s.as_secs_f64()));
     }
-    parts.map(|mut part| {
-        part.sort_by(f64::total_cmp);
-        part[part.len() / 2]
-    })
+    least
 }
 
 /// 100 frames of 1500 points: least time of some rounds, ours and theirs by turns.

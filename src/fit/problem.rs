@@ -149,7 +149,7 @@ impl<'a> Problem<'a> {
         pull.clear();
         pull.force(p.node as usize, &p.centre, force);
         pull.size(0, force.dot(&(p.centre - state.carriers[frame].position)));
-        let growth = p.length_velocity(&Vector3::zeros(), state.shape.lengths[p.limb as usize]);
+        let growth = p.world_from_node * p.lengthening(&Vector3::zeros()) / state.shape.lengths[p.limb as usize];
         pull.size(size(layout.length(p.limb)), force.dot(&growth));
     }
 
@@ -169,8 +169,9 @@ impl<'a> Problem<'a> {
             pull.force(p.node as usize, &frozen.x, &share.force);
             let limb = p.limb as usize;
             let (length, width) = (state.shape.lengths[limb], state.shape.widths[limb]);
-            pull.size(size(layout.length(p.limb)), share.force.dot(&p.length_velocity(&share.unit, length)));
-            pull.size(size(layout.width(p.limb)), share.force.dot(&p.width_velocity(&share.unit, width)));
+            let in_node = p.world_from_node.transpose() * share.force;
+            pull.size(size(layout.length(p.limb)), in_node.dot(&p.lengthening(&share.unit)) / length);
+            pull.size(size(layout.width(p.limb)), in_node.dot(&p.widening(&share.unit)) / width);
         }
         pull.size(0, force.dot(&(frozen.x - state.carriers[frame].position)));
         (frozen.metres_per_root * (e.root() - SKIN.sqrt()), -frozen.metres_per_root * e.root_slope())
@@ -228,10 +229,8 @@ impl<'a> Problem<'a> {
 
     fn frame_cost(&self, state: &State, surface: &Surface, frame: usize) -> f64 {
         let posed = state.posed(self.curve, surface, frame);
-        let mut evaluation = Evaluation::default();
         let squares = self.frozen[frame].iter().filter(|f| f.weight > 0.0).map(|f| {
-            posed.surface.evaluate_among(&f.near, &f.x, &mut evaluation);
-            let r = f.metres_per_root * (evaluation.root() - SKIN.sqrt());
+            let r = f.metres_per_root * (posed.surface.root_among(&f.near, &f.x) - SKIN.sqrt());
             0.5 * f.weight * r * r
         });
         let points: f64 = squares.sum();

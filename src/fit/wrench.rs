@@ -9,12 +9,12 @@
 
 use nalgebra::Vector3;
 
-use super::state::{Layout, Motion, SIZES, Twist};
+use super::state::{Layout, Motion, SIZES};
 use crate::body::NODES;
 use crate::math::arrow::NormalEquations;
 
-/// Wrenches of all nodes, then stature, lengths and widths.
-const WIDTH: usize = 6 * NODES + SIZES;
+/// Pairs of nodes, the lower half.
+const PAIRS: usize = NODES * (NODES + 1) / 2;
 /// More nodes than make the skin at any point.
 const MOST_NODES: usize = 16;
 
@@ -63,16 +63,32 @@ impl Pull {
 /// Half the sum of ω r², its gradient and Gauss–Newton Hessian over wrenches and sizes.
 pub(super) struct Gathered {
     cost: f64,
-    gradient: Vec<f64>,
-    /// Rows of WIDTH; node blocks below the diagonal only, and the rows of the sizes.
-    hessian: Vec<f64>,
+    gradient: [[f64; 6]; NODES],
+    size_gradient: [f64; SIZES],
+    /// Blocks of nodes i ≥ j at [`pair`]; rows are those of i.
+    blocks: Vec<[[f64; 6]; 6]>,
+    /// Sizes against wrenches, and against sizes.
+    size_nodes: Vec<[[f64; 6]; NODES]>,
+    size_sizes: [[f64; SIZES]; SIZES],
     /// Bit j of entry i ≥ j: nodes i and j have met.
     met: [u32; NODES],
 }
 
+fn pair(i: usize, j: usize) -> usize {
+    i * (i + 1) / 2 + j
+}
+
 impl Gathered {
     pub fn new() -> Gathered {
-        Gathered { cost: 0.0, gradient: vec![0.0; WIDTH], hessian: vec![0.0; WIDTH * WIDTH], met: [0; NODES] }
+        Gathered {
+            cost: 0.0,
+            gradient: [[0.0; 6]; NODES],
+            size_gradient: [0.0; SIZES],
+            blocks: vec![[[0.0; 6]; 6]; PAIRS],
+            size_nodes: vec![[[0.0; 6]; NODES]; SIZES],
+            size_sizes: [[0.0; SIZES]; SIZES],
+            met: [0; NODES],
+        }
     }
 
     /// Adds ½ weight r² with r's derivative `factor` times the pull.
@@ -82,26 +98,20 @@ impl Gathered {
         let nodes = &mut pull.nodes[..pull.count];
         nodes.sort_unstable_by_key(|n| n.0);
         for (i, (a, of_a)) in nodes.iter().enumerate() {
-            (0..6).for_each(|r| self.gradient[6 * a + r] += weight * residual * of_a[r]);
+            add_scaled(&mut self.gradient[*a], weight * residual, of_a);
             for (b, of_b) in &nodes[..=i] {
                 self.met[*a] |= 1 << b;
-                for (r, v) in of_a.iter().enumerate() {
-                    let scaled = weight * v;
-                    let row = &mut self.hessian[(6 * a + r) * WIDTH + 6 * b..][..6];
-                    row.iter_mut().zip(of_b).for_each(|(h, w)| *h += scaled * w);
-                }
+                let block = &mut self.blocks[pair(*a, *b)];
+                block.iter_mut().zip(of_a).for_each(|(row, v)| add_scaled(row, weight * v, of_b));
             }
         }
         for (a, value) in &pull.sizes {
-            let (a, scaled) = (6 * NODES + a, weight * value);
-            self.gradient[a] += residual * scaled;
-            for (b, of_b) in nodes.iter() {
-                let row = &mut self.hessian[a * WIDTH + 6 * b..][..6];
-                row.iter_mut().zip(of_b).for_each(|(h, w)| *h += scaled * w);
-            }
-            for (b, other) in &pull.sizes {
-                self.hessian[a * WIDTH + 6 * NODES + b] += scaled * other;
-            }
+            let scaled = weight * value;
+            self.size_gradient[*a] += residual * scaled;
+            let of_nodes = &mut self.size_nodes[*a];
+            nodes.iter().for_each(|(b, of_b)| add_scaled(&mut of_nodes[*b], scaled, of_b));
+            let of_sizes = &mut self.size_sizes[*a];
+            pull.sizes.iter().for_each(|(b, other)| of_sizes[*b] += scaled * other);
         }
     }
 
@@ -135,9 +145,8 @@ impl Gathered {
                 }
             }
             for (r, row) in product.chunks_exact_mut(size).enumerate() {
-                let pairs = (0..SIZES).map(|d| self.hessian[(6 * NODES + d) * WIDTH + 6 * i + r]);
-                row[first_size..].iter_mut().zip(pairs).for_each(|(p, pair)| *p += pair);
-                add_scaled(&mut normal.gradient, self.gradient[6 * i + r], twist.row(r));
+                row[first_size..].iter_mut().zip(&self.size_nodes).for_each(|(p, of_nodes)| *p += of_nodes[i][r]);
+                add_scaled(&mut normal.gradient, self.gradient[i][r], twist.row(r));
             }
             for (a, row) in normal.hessian.chunks_exact_mut(size).enumerate() {
                 let factors: [f64; 6] = std::array::from_fn(|r| twist.row(r)[a]);
@@ -147,25 +156,20 @@ impl Gathered {
             }
         }
         for d in 0..SIZES {
-            let (from, a) = (6 * NODES + d, first_size + d);
-            normal.gradient[a] += self.gradient[from];
+            let a = first_size + d;
+            normal.gradient[a] += self.size_gradient[d];
             let row = &mut normal.hessian[a * size..=a * size + a];
-            for (j, twist) in motion.twists.iter().enumerate() {
-                let pairs: [f64; 6] = std::array::from_fn(|r| self.hessian[from * WIDTH + 6 * j + r]);
-                if pairs != [0.0; 6] {
-                    add_six(row, &pairs, std::array::from_fn(|r| &twist.row(r)[..=a]));
-                }
+            for (pairs, twist) in self.size_nodes[d].iter().zip(&motion.twists).filter(|(pairs, _)| **pairs != [0.0; 6]) {
+                add_six(row, pairs, std::array::from_fn(|r| &twist.row(r)[..=a]));
             }
-            let sizes = &self.hessian[from * WIDTH + 6 * NODES..];
-            row[first_size..].iter_mut().zip(sizes).for_each(|(h, s)| *h += s);
+            add_scaled(&mut row[first_size..], 1.0, &self.size_sizes[d]);
         }
         normal
     }
 
     /// Row `r` of block (i, j) of M.
     fn block_row(&self, i: usize, j: usize, r: usize) -> [f64; 6] {
-        let at = |c: usize| if i >= j { (6 * i + r) * WIDTH + 6 * j + c } else { (6 * j + c) * WIDTH + 6 * i + r };
-        std::array::from_fn(|c| self.hessian[at(c)])
+        if i >= j { self.blocks[pair(i, j)][r] } else { self.blocks[pair(j, i)].map(|row| row[r]) }
     }
 }
 
