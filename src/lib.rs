@@ -5,6 +5,8 @@
 //! weights of a PCA motion model ([`fit`], [`motion_model`]). The weights are the person's style ([`style`]); with them the
 //! same person walks, runs or jumps at speeds and lengths never filmed ([`motion`]).
 //!
+//! An animal needs one camera only, and an artist's key poses ([`animal`]).
+//!
 //! The "style paper" of the modules' texts is R. Urtasun, P. Glardon, R. Boulic, D. Thalmann and P. Fua, "Style-Based Motion
 //! Synthesis", Computer Graphics Forum 23(4), 2004.
 //!
@@ -55,6 +57,8 @@ pub mod fit;
 pub mod style;
 
 pub mod motion;
+
+pub mod animal;
 
 pub mod phantom;
 

@@ -42,7 +42,7 @@ fn the_whole_job_ends_near_the_truth_and_does_not_depend_on_threads() {
     let output = folder.path().join("demo");
     let (done, table, progress) = demo(&output, "2");
     assert!(done, "{progress}");
-    assert!(table.contains("seconds per stage") && table.contains("pictures/overlay.png") && progress.contains("fit: done in"));
+    assert!(table.contains("seconds per stage") && table.contains("pictures/overlay_cam_00.png") && progress.contains("fit: done in"));
 
     let csv = std::fs::read_to_string(output.join("errors.csv")).unwrap();
     let (values, beside) = errors(&csv);
@@ -69,7 +69,7 @@ fn the_whole_job_ends_near_the_truth_and_does_not_depend_on_threads() {
         assert!((speed * 3.6 / f64::from(kmh) - 1.0).abs() < 0.01 && (fps - 60.0).abs() < 0.01, "{kmh}: {speed} {fps}");
     }
 
-    for name in ["overlay", "cloud", "depth", "angles", "speeds"] {
+    for name in ["overlay_cam_00", "cloud", "phase", "root", "weights", "depth", "angles", "speeds"] {
         let picture = std::fs::read(output.join(format!("pictures/{name}.png"))).unwrap();
         assert!(picture.starts_with(b"\x89PNG") && picture.len() > 5000, "{name}");
     }

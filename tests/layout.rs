@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Module and the modules it may use; `math` is free to all.
-const ALLOWED: [(&str, &[&str]); 14] = [
+const ALLOWED: [(&str, &[&str]); 15] = [
     ("math", &[]),
     ("rig", &[]),
     ("body", &[]),
@@ -14,10 +14,11 @@ const ALLOWED: [(&str, &[&str]); 14] = [
     ("fit", &["clouds", "footage", "rig", "body", "motion_model"]),
     ("style", &["motion_model", "body"]),
     ("motion", &["style", "motion_model", "body"]),
+    ("animal", &["footage", "body"]),
     ("phantom", &["rig", "body", "footage", "motion_model"]),
-    ("io", &["rig", "body", "motion_model", "footage", "clouds", "fit", "style", "motion", "phantom"]),
-    ("report", &["rig", "body", "motion_model", "footage", "clouds", "fit", "style", "motion", "phantom", "io"]),
-    ("cli", &["rig", "body", "motion_model", "footage", "clouds", "fit", "style", "motion", "phantom", "io", "report"]),
+    ("io", &["rig", "body", "motion_model", "footage", "clouds", "fit", "style", "motion", "animal", "phantom"]),
+    ("report", &["rig", "body", "motion_model", "footage", "clouds", "fit", "style", "motion", "animal", "phantom", "io"]),
+    ("cli", &["rig", "body", "motion_model", "footage", "clouds", "fit", "style", "motion", "animal", "phantom", "io", "report"]),
     ("main.rs", &["cli"]),
 ];
 

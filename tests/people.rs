@@ -174,6 +174,51 @@ fn clouds_lie_on_the_skin_and_nearer_to_it_than_semi_global_matching() {
     }
 }
 
+/// Share of the reference's disparities on the person that are off by more than 1 px, and their number. The truth is the
+/// skin's depth where all four pixels around are the person's.
+fn off(take: &Take, cameras: &[usize]) -> (f64, usize) {
+    let rig = Rig { cameras: cameras.iter().map(|k| take.rig.cameras[*k].clone()).collect(), up: take.rig.up };
+    let pick = |images: &[GrayImage]| -> Vec<GrayImage> { cameras.iter().map(|k| images[*k].clone()).collect() };
+    let options = CloudOptions::default();
+    let ready = CloudRig::new(&rig, Some(&pick(&take.stages)), &options).unwrap();
+    let found = ready.frame(&pick(&take.images), &options).unwrap();
+    let group = &ready.groups[0].0;
+    let (map, silhouette) = (depth(&take.scene, &take.view(0), &take.pose), mask(&take.scene, &take.view(0), &take.pose));
+    let (camera, step) = (&take.rig.cameras[0], group.views[1].step);
+    let (mut count, mut wrong) = (0, 0);
+    for (u, v, d) in found.disparity.enumerate_pixels().filter(|(_, _, d)| d.0[0] > 0.0) {
+        let Some(raw) = group.raw_pixel(0, &nalgebra::Vector2::new(u.into(), v.into())) else { continue };
+        let (x, y) = (raw.x as u32, raw.y as u32);
+        let corners = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)];
+        if corners.iter().any(|(x, y)| silhouette.get_pixel(*x, *y).0[0] == 0) {
+            continue;
+        }
+        let ray = camera.ray(&raw).unwrap();
+        let disparity = |&(x, y): &(u32, u32)| {
+            let point = camera.centre() + ray * (f64::from(map.get_pixel(x, y).0[0]) / (camera.camera_from_world * ray).z);
+            (group.project(1, &point).unwrap() - group.project(0, &point).unwrap()).dot(&step) / step.norm_squared()
+        };
+        // Where a step between limbs lies within the pixel, either side is right.
+        let least = corners.iter().map(|c| (f64::from(d.0[0]) - disparity(c)).abs()).fold(f64::INFINITY, f64::min);
+        (count, wrong) = (count + 1, wrong + usize::from(least > 1.0));
+    }
+    (wrong as f64 / count as f64, count)
+}
+
+#[test]
+fn three_views_are_off_less_often_than_pairs() {
+    let (mut three, mut pairs) = (0.0, 0.0);
+    for seed in [21, 22, 23] {
+        let take = film(lab(), seed, 2.0);
+        let (all, points) = off(&take, &[0, 1, 2]);
+        let ((right, of_right), (upper, of_upper)) = (off(&take, &[0, 1]), off(&take, &[0, 2]));
+        println!("seed {seed}: {all:.4} of {points}; pairs {right:.4} of {of_right}, {upper:.4} of {of_upper}");
+        assert!(points > 9_000 && 10 * points > 9 * of_right.max(of_upper));
+        (three, pairs) = (three + all, pairs + 0.5 * (right + upper));
+    }
+    assert!(pairs > 0.0 && three < 0.7 * pairs, "{three} {pairs}");
+}
+
 /// Variance of the errors within 3 sigma over that of a normal distribution cut there, and the part beyond.
 fn spread(z: &[f64]) -> [f64; 2] {
     let within: Vec<f64> = z.iter().copied().filter(|z| z.abs() < 3.0).collect();

@@ -259,9 +259,9 @@ impl Near {
         self.indices[..self.count as usize].iter().map(|i| *i as usize)
     }
 
-    /// Those within [`NEGLIGIBLE`] of the least distance, of too many the nearest.
-    fn select(distances: impl Iterator<Item = f32> + Clone) -> Near {
-        let mut limit = distances.clone().fold(f32::INFINITY, f32::min) + NEGLIGIBLE;
+    /// Those whose d exceeds the least by less than `margin`, of too many the nearest.
+    fn select(distances: impl Iterator<Item = f32> + Clone, margin: f32) -> Near {
+        let mut limit = distances.clone().fold(f32::INFINITY, f32::min) + margin;
         loop {
             let mut near = Near::default();
             let mut farthest = f32::NEG_INFINITY;
@@ -332,10 +332,11 @@ impl PosedSurface {
         PosedSurface { search: Search::new(&primitives), primitives }
     }
 
-    /// The primitives that make the skin about `x`.
-    pub fn near(&self, x: &Vector3<f64>, scratch: &mut Evaluation) -> Near {
+    /// The primitives that make the skin about `x`: those whose d exceeds the least by less than `margin`, and so have
+    /// weights above exp(−2 margin).
+    pub fn near(&self, x: &Vector3<f64>, margin: f32, scratch: &mut Evaluation) -> Near {
         self.search.at(x, &mut scratch.distances);
-        Near::select(scratch.distances.iter().copied())
+        Near::select(scratch.distances.iter().copied(), margin)
     }
 
     /// The primitives that make the skin along a line, and the places along it, at most `count`, that come nearest to single
@@ -344,11 +345,12 @@ impl PosedSurface {
         &self,
         origin: &Vector3<f64>,
         direction: &Vector3<f64>,
+        margin: f32,
         count: usize,
         scratch: &mut Evaluation,
     ) -> (Near, impl Iterator<Item = f64> + use<>) {
         self.search.on_line(origin, direction, &mut scratch.approaches);
-        let near = Near::select(scratch.approaches.iter().map(|a| a.0));
+        let near = Near::select(scratch.approaches.iter().map(|a| a.0), margin);
         let mut places: Vec<(f32, f32)> = near.indices().map(|i| scratch.approaches[i]).collect();
         places.sort_by(|a, b| a.0.total_cmp(&b.0));
         (near, places.into_iter().take(count).map(|p| p.1.into()))
@@ -356,7 +358,7 @@ impl PosedSurface {
 
     /// d_eff, its gradient and the contributing primitives at `x`; `into` is reused between calls.
     pub fn evaluate_into(&self, x: &Vector3<f64>, into: &mut Evaluation) {
-        into.near = self.near(x, into);
+        into.near = self.near(x, NEGLIGIBLE, into);
         self.evaluate_among(&into.near.clone(), x, into);
     }
 

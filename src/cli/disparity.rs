@@ -2,8 +2,8 @@
 
 use anyhow::{Context, Result, bail};
 use image::GrayImage;
-use muybridge::clouds::correlate::{MOST_HYPOTHESES, Region};
-use muybridge::clouds::stereo::{StereoOptions, StereoView, match_view};
+use muybridge::clouds::correlate::MOST_HYPOTHESES;
+use muybridge::clouds::stereo::{StereoOptions, StereoView, disparity_map};
 use muybridge::io::pfm::write_pfm;
 use muybridge::rig::rectify::Plane;
 use nalgebra::Vector2;
@@ -64,10 +64,8 @@ pub fn run(args: &DisparityArgs) -> Result<()> {
         bail!("--max-disparity {} is more than can be searched with these baselines; give at most {most}", args.max_disparity);
     }
     let views: Vec<StereoView> = views.iter().map(|(_, image, step)| StereoView { plane: plane(image), step: *step }).collect();
-    let all = Region { x: [0, size.0 as usize], y: [0, size.1 as usize] };
     let range = [0, usize::from(args.max_disparity) - 1];
-    let found = match_view(&views, 0, all, range, &StereoOptions::default());
-    Ok(write_pfm(&args.output, &found.disparity)?)
+    Ok(write_pfm(&args.output, &disparity_map(&views, range, &StereoOptions::default()))?)
 }
 
 fn read_grey(path: &Path) -> Result<GrayImage> {

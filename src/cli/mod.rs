@@ -1,4 +1,5 @@
 //! One file per subcommand: load, call the library, save, report.
+mod animal;
 mod bench;
 mod board;
 mod calibrate;
@@ -52,6 +53,9 @@ enum Command {
     Generate(generate::GenerateArgs),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
+    /// From one video of an animal to its motion
+    #[command(subcommand)]
+    Animal(animal::AnimalCommand),
     /// Accuracy and time beside OpenCV's, against known truth
     #[command(subcommand)]
     Bench(bench::BenchCommand),
@@ -84,6 +88,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Track(args) => track::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Rig(command) => rig::run(&command),
+        Command::Animal(command) => animal::run(&command),
         Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),

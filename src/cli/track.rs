@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use image::GrayImage;
-use muybridge::body::{Clip, NODES, Placement, Pose, place};
+use muybridge::body::{Clip, NODES, Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::{self, Fit, FitOptions, Observation};
 use muybridge::footage::FrameSet;
@@ -33,7 +33,7 @@ pub struct TrackArgs {
     /// Which embedded model to use
     #[arg(long, default_value = "walking", conflicts_with = "model")]
     activity: ActivityName,
-    /// Folder for style.json, joints.csv, motion.bvh, fit.json
+    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, fit.json
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Frames per second of pictures
@@ -71,8 +71,8 @@ impl NamedModel {
 pub struct Tracked {
     pub fit: Fit,
     pub observations: Vec<Observation>,
-    /// One picture of the reference camera for each frame of the strip: index of the frame, picture.
-    pub pictures: Vec<(usize, GrayImage)>,
+    /// The pictures of all cameras for each frame of the strips: index of the frame, pictures.
+    pub pictures: Vec<(usize, Vec<GrayImage>)>,
 }
 
 pub fn run(args: &TrackArgs) -> Result<()> {
@@ -94,7 +94,7 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     let tracked = track(&session, &model, &options)?;
     write(&args.output, &session, &model, &tracked)?;
     if args.pictures {
-        draw(&args.output.join("pictures"), &session.rig, &tracked)?;
+        draw(&args.output.join("pictures"), &session.rig, &model, &tracked)?;
     }
     summary(&args.output, &tracked.fit);
     Ok(())
@@ -108,7 +108,7 @@ pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Res
 /// What the cameras saw in all frames.
 pub struct Seen {
     observations: Vec<Observation>,
-    pictures: Vec<(usize, GrayImage)>,
+    pictures: Vec<(usize, Vec<GrayImage>)>,
     floor_m: Option<f64>,
 }
 
@@ -122,7 +122,7 @@ pub fn look(session: &Session, mut each: impl FnMut(&CloudRig, &FrameSet, &Frame
     let (mut pictures, mut index) = (Vec::new(), 0);
     let observations = observe::observe(session, &rig, &cloud_options, |frame, found| {
         if index % step == 0 {
-            pictures.extend(frame.images.first().map(|image| (index, image.clone())));
+            pictures.push((index, frame.images.clone()));
         }
         index += 1;
         each(&rig, frame, found)
@@ -145,13 +145,15 @@ pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOp
     Ok(Tracked { fit, observations, pictures })
 }
 
-/// Writes the four files of a tracked session.
+/// Writes the files of a tracked session.
 pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
     let Tracked { fit, observations, .. } = tracked;
     let placements = placements(fit);
     let frames: Vec<(usize, f64)> = observations.iter().map(|o| (o.number, o.time_s)).collect();
     let positions: Vec<[Vector3<f64>; NODES]> = placements.iter().map(|p| p.positions).collect();
     joints_csv::write(&folder.join("joints.csv"), &frames, &positions)?;
+    let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
+    joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
     let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
     bvh::write_clip(&folder.join("motion.bvh"), &clip, Some(&clip_from_rig))?;
     style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
@@ -193,27 +195,56 @@ fn clip(fit: &Fit, rig: &Rig, observations: &[Observation], fps: f64) -> Result<
     Ok((Clip { fps, poses, offsets: shape.offsets(), hip_height_m: shape.hip_height_m() }, clip_from_rig))
 }
 
-/// Overlays, and the cloud with the body of the middle frame.
-pub fn draw(folder: &Path, rig: &Rig, tracked: &Tracked) -> Result<()> {
-    let Some(camera) = rig.cameras.first() else { return Ok(()) };
-    let placements = placements(&tracked.fit);
-    let (surface, offsets) = (muybridge::body::Surface::new(tracked.fit.shape()), tracked.fit.shape().offsets());
-    let mut tiles = Vec::new();
-    for (index, picture) in &tracked.pictures {
-        let placement = &placements[*index];
-        let outline = phantom::silhouette(&surface, &offsets, placement, camera);
-        let o = &tracked.observations[*index];
-        tiles.push((
-            report::overlay(picture, camera, &placement.positions, Some(&outline))?,
-            format!("frame {}, {:.2} s", o.number, o.time_s),
-        ));
+/// Overlays for each camera, the cloud with the body of the middle frame, curves of phase and root, and the weights among
+/// the model's.
+pub fn draw(folder: &Path, rig: &Rig, model: &NamedModel, tracked: &Tracked) -> Result<()> {
+    let Tracked { fit, observations, pictures } = tracked;
+    let placements = placements(fit);
+    let (surface, offsets) = (muybridge::body::Surface::new(fit.shape()), fit.shape().offsets());
+    for (k, camera) in rig.cameras.iter().enumerate() {
+        let mut tiles = Vec::new();
+        for (index, views) in pictures {
+            let (placement, o) = (&placements[*index], &observations[*index]);
+            let outline = phantom::silhouette(&surface, &offsets, placement, camera);
+            let Some(picture) = views.get(k) else { continue };
+            let drawn = report::overlay(picture, camera, &placement.positions, Some(&outline))?;
+            tiles.push((drawn, format!("frame {}, {:.2} s", o.number, o.time_s)));
+        }
+        report::save(&folder.join(format!("overlay_{}.png", camera.name)), &report::strip(&tiles, 3, 640)?)?;
     }
-    report::save(&folder.join("overlay.png"), &report::strip(&tiles, 3, 640)?)?;
     let middle = placements.len() / 2;
-    let points: Vec<Vector3<f64>> = tracked.observations[middle].cloud.points.iter().map(|p| p.position).collect();
-    let title = format!("Cloud and body, frame {}", tracked.observations[middle].number);
-    report::save(&folder.join("cloud.png"), &report::cloud_and_body(&points, &placements[middle].positions, rig.up, &title)?)?;
-    Ok(())
+    let skin = PosedSurface::new(&surface, &placements[middle]);
+    let dot = |x: Vector3<f64>| report::CloudDot { x, distance_m: skin.distance(&x) };
+    let dots: Vec<_> = observations[middle].cloud.points.iter().map(|p| dot(p.position)).collect();
+    let title = format!("Cloud and body, frame {}", observations[middle].number);
+    report::save(&folder.join("cloud.png"), &report::cloud_and_body(&dots, &placements[middle].positions, rig.up, &title)?)?;
+    draw_curves(folder, tracked)?;
+    let covariance = fit.uncertainty.as_ref().map(|u| [[u.shared[(0, 0)], u.shared[(0, 1)]], [u.shared[(1, 0)], u.shared[(1, 1)]]]);
+    let known = covariance.filter(|_| fit.state.weights.len() > 1);
+    let picture = report::clusters(&model.model, &fit.state.weights, known, "This person among the model's subjects")?;
+    Ok(report::save(&folder.join("weights.png"), &picture)?)
+}
+
+/// Two standard deviations either way of a normal hold 95 %.
+const BAND: f64 = 1.96;
+
+/// Phase, and root position and heading, over time with bands of 95 %.
+fn draw_curves(folder: &Path, tracked: &Tracked) -> Result<()> {
+    let Tracked { fit, observations, .. } = tracked;
+    let sigmas = |k: usize| -> Vec<f64> { fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| BAND * f.local[k]).collect() };
+    let series = |label: &str, colour: usize, band: Vec<f64>, value: &dyn Fn(usize) -> f64| {
+        let points = observations.iter().enumerate().map(|(t, o)| [o.time_s, value(t)]).collect();
+        report::Curve { label: label.to_string(), points, dashed: false, colour, band }
+    };
+    let carriers = &fit.state.carriers;
+    let phase = series("phase", 0, sigmas(6), &|t| carriers[t].phase);
+    let picture = report::curves("Phase, with its 95 % band", "time (s)", "phase (cycles)", &[phase])?;
+    report::save(&folder.join("phase.png"), &picture)?;
+    let start = carriers[0].position;
+    let axes = ["x", "y", "z"].iter().enumerate();
+    let root: Vec<_> = axes.map(|(k, name)| series(name, k, sigmas(3 + k), &|t| carriers[t].position[k] - start[k])).collect();
+    let picture = report::curves("Carrier of the root, with its 95 % bands", "time (s)", "way since the first frame (m)", &root)?;
+    Ok(report::save(&folder.join("root.png"), &picture)?)
 }
 
 /// Costs of the two half-cycle hypotheses closer than this leave open which leg is which.

@@ -293,19 +293,29 @@ fn refine(found: &[(StereoView, ViewDisparity)], disparity: Plane) -> Refined {
     subpixel::refine(&reference.plane, &others, &disparity, &matched.confirmed)
 }
 
+/// Disparities of two views' own matches that differ by more are of different surfaces, px.
+const AGREEMENT_PX: f32 = 1.0;
+
 /// Keeps the disparities of the reference that every view confirms which has the place in its picture. A view that finds
 /// something else there mostly contradicts a fattened edge; the places that it cannot see for an occluder are under 1 %.
+///
+/// Three views can afford more: each of the others must have matched that place itself, and alike. This costs a twentieth of the
+/// body and removes 11 to 45 % of the errors above 1 px; two views, which see less, would lose as much again.
 fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], mut disparity: Plane) -> Plane {
     let (reference, matched) = &found[0];
-    for (k, (view, _)) in found[1..].iter().enumerate() {
+    for (k, (view, own)) in found[1..].iter().enumerate() {
         let step = view.step - reference.step;
-        let sees = |u: u32, v: u32, d: f32| {
+        let stands = |u: u32, v: u32, d: f32, confirmed: u8| {
             let (x, y) = ((f64::from(u) + step.x * f64::from(d)).round(), (f64::from(v) + step.y * f64::from(d)).round());
             let inside = x >= 0.0 && y >= 0.0 && x < f64::from(view.plane.width()) && y < f64::from(view.plane.height());
-            inside && !view.plane.get_pixel(x as u32, y as u32).0[0].is_nan()
+            if !inside || view.plane.get_pixel(x as u32, y as u32).0[0].is_nan() {
+                return true;
+            }
+            let alike = (own.disparity.get_pixel(x as u32, y as u32).0[0] - d).abs() <= AGREEMENT_PX;
+            confirmed >> k & 1 != 0 && (alike || found.len() == 2)
         };
         for ((u, v, d), confirmed) in disparity.enumerate_pixels_mut().zip(&matched.confirmed) {
-            if confirmed >> k & 1 == 0 && sees(u, v, d.0[0]) {
+            if !d.0[0].is_nan() && !stands(u, v, d.0[0], *confirmed) {
                 d.0[0] = f32::NAN;
             }
         }

@@ -37,8 +37,8 @@ pub trait Lanes: Copy {
     /// Every byte one place down, the first of `after` last.
     fn lowered(self, after: Self) -> Self;
     fn wide_zero() -> Self::Wide;
-    fn wide_add(wide: Self::Wide, other: Self) -> Self::Wide;
-    fn wide_sub(wide: Self::Wide, other: Self) -> Self::Wide;
+    /// wide + entering - leaving.
+    fn wide_slide(wide: Self::Wide, entering: Self, leaving: Self) -> Self::Wide;
     /// wide * factor / 2^15, rounded, for wide and factor below 2^15 and results below 256.
     fn scaled(wide: Self::Wide, factor: i16) -> Self;
 }
@@ -119,16 +119,9 @@ impl Lanes for [u8; LANES] {
         [0; LANES]
     }
     #[inline(always)]
-    fn wide_add(mut wide: Self::Wide, other: Self) -> Self::Wide {
+    fn wide_slide(mut wide: Self::Wide, entering: Self, leaving: Self) -> Self::Wide {
         for i in 0..LANES {
-            wide[i] = wide[i].wrapping_add(u16::from(other[i]));
-        }
-        wide
-    }
-    #[inline(always)]
-    fn wide_sub(mut wide: Self::Wide, other: Self) -> Self::Wide {
-        for i in 0..LANES {
-            wide[i] = wide[i].wrapping_sub(u16::from(other[i]));
+            wide[i] = wide[i].wrapping_add(u16::from(entering[i])).wrapping_sub(u16::from(leaving[i]));
         }
         wide
     }
@@ -228,17 +221,12 @@ pub mod avx2 {
             unsafe { [_mm256_setzero_si256(); 2] }
         }
         #[inline(always)]
-        fn wide_add([low, high]: Self::Wide, other: Self) -> Self::Wide {
+        fn wide_slide([low, high]: Self::Wide, entering: Self, leaving: Self) -> Self::Wide {
             unsafe {
-                let zero = _mm256_setzero_si256();
-                [_mm256_add_epi16(low, _mm256_unpacklo_epi8(other.0, zero)), _mm256_add_epi16(high, _mm256_unpackhi_epi8(other.0, zero))]
-            }
-        }
-        #[inline(always)]
-        fn wide_sub([low, high]: Self::Wide, other: Self) -> Self::Wide {
-            unsafe {
-                let zero = _mm256_setzero_si256();
-                [_mm256_sub_epi16(low, _mm256_unpacklo_epi8(other.0, zero)), _mm256_sub_epi16(high, _mm256_unpackhi_epi8(other.0, zero))]
+                // Pairs of bytes times 1 and -1.
+                let change = |pairs| _mm256_maddubs_epi16(pairs, _mm256_set1_epi16(-0xff));
+                let (low_pairs, high_pairs) = (_mm256_unpacklo_epi8(entering.0, leaving.0), _mm256_unpackhi_epi8(entering.0, leaving.0));
+                [_mm256_add_epi16(low, change(low_pairs)), _mm256_add_epi16(high, change(high_pairs))]
             }
         }
         #[inline(always)]

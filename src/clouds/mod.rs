@@ -1,11 +1,13 @@
 //! Point clouds by three-view correlation stereo.
 
+mod candidates;
 pub mod cloud;
 pub mod correlate;
 pub mod edges;
 pub mod frame;
 mod lanes;
 pub mod prefilter;
+pub mod smooth;
 pub mod stage;
 pub mod stereo;
 pub mod subpixel;

@@ -1,7 +1,8 @@
 //! Dense disparities of two or three rectified views, seen from one of them.
 
-use super::correlate::{Matches, Pair, Region, correlate};
+use super::correlate::{Pair, Region, Scores, correlate};
 use super::prefilter;
+use super::smooth::smooth;
 use super::subpixel::equiangular;
 use super::validate::{self, Owners};
 use crate::rig::rectify::Plane;
@@ -46,7 +47,15 @@ pub struct ViewDisparity {
     pub disparity: Plane,
     /// Bits of the other views (in order, this one left out) that confirm a pixel.
     pub confirmed: Vec<u8>,
-    pub matches: Matches,
+}
+
+/// Disparities of the whole first view, averaged over their surfaces ([`super::smooth`]), px; NaN where no match stands.
+/// `range` first..=last, px.
+pub fn disparity_map(views: &[StereoView], range: [usize; 2], options: &StereoOptions) -> Plane {
+    let Some(first) = views.first() else { return Plane::default() };
+    let [width, height] = [first.plane.width(), first.plane.height()].map(|size| size as usize);
+    let found = match_view(views, 0, Region { x: [0, width], y: [0, height] }, range, options);
+    smooth(&found.disparity)
 }
 
 /// Matches every view against the others; `regions` say where each is searched, `range` the disparities first..=last.
@@ -76,23 +85,51 @@ pub fn match_view(views: &[StereoView], reference: usize, region: Region, range:
     let (width, height) = here.plane.dimensions();
     let mut disparity = Plane::from_raw(width, height, vec![f32::NAN; (width * height) as usize]).expect("one value per pixel");
     let mut confirmed = vec![0; (width * height) as usize];
-    let (tolerance, px) = ((f64::from(options.consistency_px) * per_px) as u16, (1.0 / per_px) as f32);
+    let tolerance = (f64::from(options.consistency_px) * per_px) as u16;
+    let bar = Bar { uniqueness: options.uniqueness, all: (1 << owners.len()) - 1, px: (1.0 / per_px) as f32 };
     let rows = disparity.par_chunks_exact_mut(width.max(1) as usize).zip(confirmed.par_chunks_exact_mut(width.max(1) as usize));
     rows.skip(region.y[0]).take(region.height()).enumerate().for_each(|(y, (values, confirmed))| {
         let row = y * region.width()..(y + 1) * region.width();
         let (best, confirmed) = (&matches.best[row.clone()], &mut confirmed[region.x[0]..region.x[1]]);
         validate::confirm(best, &owners, y, tolerance, confirmed);
-        let costs = matches.cost[row.clone()].iter().zip(&matches.rival[row]);
-        let found = best.iter().zip(costs).zip(confirmed).zip(&mut values[region.x[0]..region.x[1]]);
-        for (((best, (cost, rival)), confirmed), value) in found {
-            let ratio = if confirmed.count_ones() as usize == owners.len() { options.uniqueness } else { 2.0 * options.uniqueness };
-            if *confirmed != 0 && validate::unique(cost[1], *rival, ratio) {
-                *value = equiangular(*cost).map_or(f32::NAN, |offset| (f32::from(*best) + offset) * px);
-            }
-        }
+        believe_row(&bar, best, &matches.scores[row], confirmed, &mut values[region.x[0]..region.x[1]]);
     });
     validate::remove_speckles(&mut disparity, options.speckle_area_px, options.speckle_step_px);
-    ViewDisparity { disparity, confirmed, matches }
+    ViewDisparity { disparity, confirmed }
+}
+
+/// What a winner must meet.
+struct Bar {
+    uniqueness: f32,
+    /// The bits of all other views.
+    all: u8,
+    /// Disparity of one hypothesis.
+    px: f32,
+}
+
+/// Sub-pixel disparities of the winners of a row that stand.
+fn believe_row(bar: &Bar, best: &[u16], scores: &[Scores], confirmed: &[u8], values: &mut [f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { believe_row_avx2(bar, best, scores, confirmed, values) };
+    }
+    believe_row_plain(bar, best, scores, confirmed, values);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn believe_row_avx2(bar: &Bar, best: &[u16], scores: &[Scores], confirmed: &[u8], values: &mut [f32]) {
+    believe_row_plain(bar, best, scores, confirmed, values);
+}
+
+#[inline(always)]
+fn believe_row_plain(bar: &Bar, best: &[u16], scores: &[Scores], confirmed: &[u8], values: &mut [f32]) {
+    for (((best, scores), confirmed), value) in best.iter().zip(scores).zip(confirmed).zip(values) {
+        let ratio = if *confirmed == bar.all { bar.uniqueness } else { 2.0 * bar.uniqueness };
+        let disparity = (f32::from(*best) + equiangular(*scores)) * bar.px;
+        *value = if (*confirmed != 0) & validate::unique(*scores, ratio) { disparity } else { f32::NAN };
+    }
 }
 
 fn others_of(views: &[StereoView], k: usize) -> impl Iterator<Item = &StereoView> {

@@ -10,81 +10,97 @@
 //! A bar for texture is left out: where there is none, rivals are as good as the winner, and a bar that adds anything to
 //! uniqueness takes bare skin first.
 
-use super::correlate::{Matches, NO_MATCH, Pair};
+use super::correlate::{Matches, Pair, Scores};
 use crate::rig::rectify::Plane;
 use image::GrayImage;
 use rayon::prelude::*;
 
 /// Whether the winner of a pixel stands alone.
-pub fn unique(cost: u8, rival: u8, ratio: f32) -> bool {
-    f32::from(rival) > f32::from(cost) * (1.0 + ratio)
+#[inline(always)]
+pub fn unique(scores: Scores, ratio: f32) -> bool {
+    f32::from(scores[3]) > f32::from(scores[1]) * (1.0 + ratio)
 }
-
-/// Set beside the views' own bits where any contradicts.
-const CONTRADICTED: u8 = 1 << 7;
 
 /// Bits of the views that confirm each pixel of row `y` of a region, none where any contradicts.
 pub fn confirm(best: &[u16], owners: &[Owners], y: usize, tolerance: u16, bits: &mut [u8]) {
-    for (k, owners) in owners.iter().enumerate() {
-        let keys = &owners.keys[y * owners.width..];
-        for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
-            let Some(shift) = owners.shifts.get(usize::from(h)) else { continue };
-            let owner = keys[x + *shift as usize] as u16;
-            *bits |= u8::from(owner.abs_diff(h) <= tolerance) << k;
-            *bits |= if owner < h.saturating_sub(tolerance) { CONTRADICTED } else { 0 };
-        }
+    match owners {
+        [one] => confirm_row([one], best, y, tolerance, bits),
+        [one, other] => confirm_row([one, other], best, y, tolerance, bits),
+        _ => bits.fill(0),
     }
-    bits.iter_mut().for_each(|bits| *bits = if *bits & CONTRADICTED != 0 { 0 } else { *bits });
+}
+
+#[inline(always)]
+fn confirm_row<const VIEWS: usize>(owners: [&Owners; VIEWS], best: &[u16], y: usize, tolerance: u16, bits: &mut [u8]) {
+    let rows = owners.map(|owners| (&owners.keys[y * owners.width..], &owners.shifts[..]));
+    let tolerance = i32::from(tolerance);
+    for (x, (bits, &h)) in bits.iter_mut().zip(best).enumerate() {
+        let (mut found, mut contradicted) = (0, false);
+        for (k, (keys, shifts)) in rows.iter().enumerate() {
+            let Some(shift) = shifts.get(usize::from(h)) else { continue };
+            let above = i32::from(!keys[x + *shift as usize] as u16) - i32::from(h) + tolerance;
+            found |= u8::from(above as u32 <= 2 * tolerance as u32) << k;
+            contradicted |= above < 0;
+        }
+        *bits = if contradicted { 0 } else { found };
+    }
 }
 
 /// For every place of another view, the cheapest winner that leads to it.
 pub struct Owners {
-    /// Cost above hypothesis, so that the least key is the cheapest winner, and of equal ones the farthest. Where nothing is
-    /// known the hypothesis is [`NO_MATCH`], nearer than all.
+    /// 255 less the cost above the complement of the hypothesis, so that the greatest key is the cheapest winner, and of equal
+    /// ones the farthest. [`NOBODY`] and [`UNKNOWN`] hold the complement of [`super::correlate::NO_MATCH`], nearer than all.
     keys: Vec<u32>,
     width: usize,
     /// How far each hypothesis leads in `keys`.
     shifts: Vec<u32>,
 }
 
+/// Key of a place that no winner leads to.
+const NOBODY: u32 = 0;
+/// Key of a place that the other picture does not show; greater than any winner's.
+const UNKNOWN: u32 = 0xffff_0000;
+
 impl Owners {
     pub fn new(matches: &Matches, pair: &Pair) -> Self {
         let (width, height) = (matches.region.width(), matches.region.height());
-        let reach = matches.best.iter().filter(|b| **b != NO_MATCH).max().map_or(0, |b| usize::from(*b) + 1);
+        // NO_MATCH becomes 0.
+        let reach = matches.best.iter().map(|best| best.wrapping_add(1)).max().map_or(0, usize::from);
         let shifts: Vec<[isize; 2]> = (0..reach).map(|h| (pair.step * h as f64).map(|v| v.round() as isize).into()).collect();
         let ends = |i: usize| shifts.iter().fold([0, 0], |[low, high], s| [s[i].min(low), s[i].max(high)]);
         let ([left, right], [top, bottom]) = (ends(0), ends(1));
         let wide = width + (right - left) as usize;
-        let mut keys = vec![u32::MAX; wide * (height + (bottom - top) as usize)];
+        let start = [matches.region.x[0] as isize + left, matches.region.y[0] as isize + top];
+        let mut keys = unclaimed(wide, height + (bottom - top) as usize, &pair.other, start);
         let shifts: Vec<u32> = shifts.iter().map(|s| ((s[1] - top) as usize * wide + (s[0] - left) as usize) as u32).collect();
-        let rows = matches.best.chunks_exact(width.max(1)).zip(matches.cost.chunks_exact(width.max(1)));
-        for (y, (best, cost)) in rows.enumerate() {
-            for (x, (&h, cost)) in best.iter().zip(cost).enumerate().filter(|(_, (h, _))| **h != NO_MATCH) {
-                let key = &mut keys[y * wide + x + shifts[usize::from(h)] as usize];
-                *key = (*key).min(u32::from(cost[1]) << 16 | u32::from(h));
+        let rows = matches.best.chunks_exact(width.max(1)).zip(matches.scores.chunks_exact(width.max(1)));
+        for (y, (best, scores)) in rows.enumerate() {
+            let keys = &mut keys[y * wide..];
+            for (x, (&h, scores)) in best.iter().zip(scores).enumerate() {
+                let Some(shift) = shifts.get(usize::from(h)) else { continue };
+                let key = &mut keys[x + *shift as usize];
+                *key = (*key).max(u32::from(!scores[1]) << 16 | u32::from(!h));
             }
         }
-        let start = [matches.region.x[0] as isize + left, matches.region.y[0] as isize + top];
-        hide_unknown(&mut keys, wide, &pair.other, start);
         Self { keys, width: wide, shifts }
     }
 }
 
-/// Marks the places of `keys`, whose first is pixel `start`, that the picture does not show.
-fn hide_unknown(keys: &mut [u32], wide: usize, picture: &GrayImage, start: [isize; 2]) {
+/// Keys of `tall` rows of `wide` places, the first of which is pixel `start`: [`UNKNOWN`] where the picture shows nothing.
+fn unclaimed(wide: usize, tall: usize, picture: &GrayImage, start: [isize; 2]) -> Vec<u32> {
     let (width, height) = (picture.width() as isize, picture.height() as isize);
     let (from, to) = (start[0].clamp(0, width), (start[0] + wide as isize).clamp(0, width));
-    for (y, keys) in (start[1]..).zip(keys.chunks_exact_mut(wide.max(1))) {
-        if y < 0 || y >= height || from >= to {
-            keys.fill(NO_MATCH.into());
-            continue;
+    let mut keys = Vec::with_capacity(wide * tall);
+    for y in (start[1]..).take(tall) {
+        let end = keys.len() + wide;
+        if y >= 0 && y < height && from < to {
+            keys.resize(keys.len() + (from - start[0]) as usize, UNKNOWN);
+            let known = &picture.as_raw()[(y * width + from) as usize..(y * width + to) as usize];
+            keys.extend(known.iter().map(|&value| if value == 0 { UNKNOWN } else { NOBODY }));
         }
-        let (first, count) = ((from - start[0]) as usize, (to - from) as usize);
-        let known = &picture.as_raw()[(y * width + from) as usize..][..count];
-        keys[..first].fill(NO_MATCH.into());
-        keys[first + count..].fill(NO_MATCH.into());
-        keys[first..].iter_mut().zip(known).for_each(|(key, &value)| *key = if value == 0 { NO_MATCH.into() } else { *key });
+        keys.resize(end, UNKNOWN);
     }
+    keys
 }
 
 /// Removes connected pieces of fewer than `area_px` pixels; neighbours belong together when they differ by at most `step_px`.
@@ -161,7 +177,7 @@ fn join(parents: &mut [u32], a: usize, b: usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clouds::correlate::Region;
+    use crate::clouds::correlate::{NO_MATCH, Region};
     use image::Luma;
     use nalgebra::Vector2;
 
@@ -185,10 +201,10 @@ mod tests {
     fn the_cheapest_winner_owns_a_place() {
         // 10, 12 and 13 lead to place 6 of a view on the right, 14 alone to place 10, 3 leaves the picture.
         let region = Region { x: [0, 20], y: [0, 1] };
-        let mut matches = Matches { region, best: vec![NO_MATCH; 20], cost: vec![[9; 3]; 20], rival: vec![255; 20] };
+        let mut matches = Matches { region, best: vec![NO_MATCH; 20], scores: vec![[9, 9, 9, 255]; 20] };
         for (x, h, cost) in [(10, 4, 7), (12, 6, 5), (13, 7, 9), (16, 10, 9), (14, 4, 100), (3, 4, 1)] {
             matches.best[x] = h;
-            matches.cost[x][1] = cost;
+            matches.scores[x][1] = cost;
         }
         let pair = |x: f64, y: f64| Pair {
             reference: GrayImage::from_pixel(20, 1, Luma([128])),
@@ -206,7 +222,7 @@ mod tests {
         assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0)])), [0, 1, 1, 0, 1, 0]);
         assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)])), [2, 3, 3, 0, 3, 2]);
         // A farther winner contradicts all that would hide it.
-        (matches.best[8], matches.cost[8][1]) = (2, 1);
+        (matches.best[8], matches.scores[8][1]) = (2, 1);
         assert_eq!(at(&confirmed(&matches, &[pair(-1.0, 0.0), pair(0.0, 1.0)])), [0, 0, 0, 0, 3, 2]);
     }
 }

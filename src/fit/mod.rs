@@ -7,6 +7,7 @@
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
 pub mod curve;
+pub mod people;
 pub mod problem;
 pub mod start;
 pub mod state;
@@ -38,6 +39,12 @@ pub enum FitError {
         "nobody to fit: only {with_person} of {frames} frames have a cloud of {points} points or more; check that a person walks through the view of all cameras and that the empty-stage pictures belong to this session"
     )]
     NobodySeen { frames: usize, with_person: usize, points: usize },
+    #[error("{frames} frames are too few for a motion, the fit needs {needed} or more; give it the whole sequence")]
+    TooShort { frames: usize, needed: usize },
+    #[error(
+        "{crowded} of {frames} frames show two people or more, who cannot be told apart; keep one person on the stage, or cut the frames with the others out"
+    )]
+    Crowd { crowded: usize, frames: usize },
     #[error("the motion model holds no cycles; build it again with `muybridge model build`")]
     EmptyModel,
     #[error("interrupted; nothing was written, run the same command to begin again")]
@@ -106,6 +113,9 @@ const SETTINGS: Settings = Settings {
     deviation: 0.1,
     turn_acceleration: 40.0,
 };
+
+/// A second person in more than one of so many frames is one too many.
+const CROWDED: usize = 4;
 
 /// Steadiness of the phase while the start is still rough.
 const STEADY_PHASE: f64 = 0.3;
@@ -179,6 +189,14 @@ pub fn fit(
     let step = |share| if progress(share) { Ok(()) } else { Err(FitError::Interrupted) };
     let up = rig.up.direction();
     let viewpoint = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len().max(1) as f64;
+    if observations.len() < start::FEWEST_FRAMES {
+        return Err(FitError::TooShort { frames: observations.len(), needed: start::FEWEST_FRAMES });
+    }
+    let (alone, crowded) = people::largest(observations, &up);
+    if CROWDED * crowded > observations.len() {
+        return Err(FitError::Crowd { crowded, frames: observations.len() });
+    }
+    let observations = &alone;
     let track = start::track(observations, &viewpoint, &up, floor_m)?;
     let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
     let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
@@ -209,9 +227,7 @@ pub fn fit(
     step(0.4)?;
     let last = Stage { free: SHAPED, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
-    step(0.5)?;
-    state = run.stage(state, &dense, &ten, &Stage { refreshes: 6, ..last });
-    step(0.6)?;
+    step(0.55)?;
     let curve = Curve::new(model, options.components);
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &dense, &curve, &last);

@@ -22,7 +22,7 @@ use crate::motion_model::Model;
 /// Clouds with fewer points say nothing about where the person is.
 const FEWEST_POINTS: usize = 60;
 /// A path of fewer frames has no speed.
-const FEWEST_FRAMES: usize = 5;
+pub const FEWEST_FRAMES: usize = 5;
 /// From the front of the body to its middle.
 const HALF_DEPTH_M: f64 = 0.09;
 /// A floor farther than this from the lowest points is not the one that the person walks on.

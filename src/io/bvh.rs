@@ -287,7 +287,7 @@ fn write_frame(text: &mut String, pose: &Pose, previous: &mut [[f64; 3]]) {
 
 /// Angles z, x, y of R = Rz Rx Ry, of the two solutions and their turns the one nearest to the frame before, so that curves
 /// stay smooth in an editor.
-fn zxy_near(rotation: &UnitQuaternion<f64>, previous: &[f64; 3]) -> [f64; 3] {
+pub(crate) fn zxy_near(rotation: &UnitQuaternion<f64>, previous: &[f64; 3]) -> [f64; 3] {
     use std::f64::consts::{PI, TAU};
     let r = rotation.to_rotation_matrix();
     let sin_x = r[(2, 1)].clamp(-1.0, 1.0);

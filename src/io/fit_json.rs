@@ -7,7 +7,8 @@ use serde::Serialize;
 
 use super::write_atomic;
 use crate::body::Length;
-use crate::fit::{Fit, Observation, state::LOCAL, weighing::total};
+use crate::fit::state::{DEVIATING, LOCAL};
+use crate::fit::{Fit, Observation, weighing::total};
 
 /// Fewer inlying points than this leave a frame to its neighbours.
 const FEW_POINTS: usize = 40;
@@ -27,6 +28,14 @@ struct FitReport<'a> {
     points: usize,
     points_used: usize,
     effective_measurements: f64,
+    /// Misfit of the body's skin beyond the points' own noise, and what a cloud point and a silhouette ray are worth as
+    /// parts of an independent measurement: what the standard deviations here rest on.
+    skin_misfit_m: Option<f64>,
+    information_per_point: Option<f64>,
+    information_per_ray: Option<f64>,
+    /// Whether single joints left the motion model, and by how much all the time, degrees, by joint.
+    leaves_model: bool,
+    posture_deg: BTreeMap<&'static str, [f64; 3]>,
     speed_m_s: f64,
     cadence_hz: f64,
     hip_height_m: f64,
@@ -75,6 +84,11 @@ pub fn write(path: &Path, fit: &Fit, observations: &[Observation], model: &str, 
         points: observations.iter().map(|o| o.cloud.points.len()).sum(),
         points_used: sum.inliers,
         effective_measurements: sum.effective,
+        skin_misfit_m: fit.uncertainty.as_ref().map(|u| u.misfit_m),
+        information_per_point: fit.uncertainty.as_ref().map(|u| u.shares[0]),
+        information_per_ray: fit.uncertainty.as_ref().map(|u| u.shares[1]),
+        leaves_model: !fit.state.deviations.is_empty(),
+        posture_deg: DEVIATING.iter().zip(&fit.state.posture).map(|(j, turn)| (j.name(), (*turn).map(f64::to_degrees).into())).collect(),
         speed_m_s: fit.speed_m_s,
         cadence_hz: fit.cadence_hz,
         hip_height_m: shape.hip_height_m(),

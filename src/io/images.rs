@@ -35,13 +35,18 @@ pub fn is_image_name(path: &Path) -> bool {
 
 /// Reads a whole picture as grey.
 pub fn read_grey(path: &Path) -> Result<GrayImage, ImageError> {
+    read_any(path).map(grey)
+}
+
+/// Reads a whole picture as it is.
+pub fn read_any(path: &Path) -> Result<DynamicImage, ImageError> {
     let bytes = std::fs::read(path).map_err(|error| ImageError::Read { path: path.into(), error })?;
     let format = format_of(path, &bytes)?;
     if !ends_whole(&bytes, format) {
         return Err(ImageError::Truncated { path: path.into() });
     }
     let damaged = |e: image::ImageError| ImageError::Damaged { path: path.into(), message: e.to_string().replace('\n', ", ") };
-    Ok(grey(image::load_from_memory_with_format(&bytes, format).map_err(damaged)?))
+    image::load_from_memory_with_format(&bytes, format).map_err(damaged)
 }
 
 /// Looks at the first and last bytes of a picture only, and refuses one that is no picture or has lost its end.

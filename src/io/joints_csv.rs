@@ -62,6 +62,22 @@ pub fn write(path: &Path, frames: &[(usize, f64)], positions: &[[Vector3<f64>; N
     write_atomic(path, text.as_bytes()).map_err(|error| JointsCsvError::Io { path: path.into(), error })
 }
 
+/// Writes the standard deviations of the positions of [`write`], `frame,time_s,joint,sigma_x_m,sigma_y_m,sigma_z_m`;
+/// empty cells where they are not known.
+pub fn write_sigmas(path: &Path, frames: &[(usize, f64)], sigmas_m: &[[Vector3<f64>; NODES]]) -> Result<(), JointsCsvError> {
+    let mut text = String::from("frame,time_s,joint,sigma_x_m,sigma_y_m,sigma_z_m\n");
+    for (t, (frame, time_s)) in frames.iter().enumerate() {
+        for (joint, name) in columns() {
+            let known = sigmas_m.get(t).map(|s| s[joint as usize]).filter(|s| s.iter().all(|v| v.is_finite()));
+            let _ = match known {
+                Some(s) => writeln!(text, "{frame},{time_s:.6},{name},{:.5},{:.5},{:.5}", s.x, s.y, s.z),
+                None => writeln!(text, "{frame},{time_s:.6},{name},,,"),
+            };
+        }
+    }
+    write_atomic(path, text.as_bytes()).map_err(|error| JointsCsvError::Io { path: path.into(), error })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,12 +1,16 @@
 //! One file per format. Degrees, millimetres and axes are converted here and nowhere else.
 
+pub mod animal_clip;
+pub mod animal_json;
 pub mod asf_amc;
 pub mod atomic;
 pub mod bvh;
 pub mod calib_toml;
 pub mod calib_views;
 pub mod calibration_json;
+pub mod creature_bvh;
 pub mod fit_json;
+pub mod glb;
 pub mod images;
 pub mod joints_csv;
 mod kalibr;

@@ -49,7 +49,7 @@ mod tests {
             weights: vec![0.1, -2.5e-3],
             covariance: Some(vec![vec![1e-4, 0.0], vec![0.0, 2e-4]]),
             cadence_factor: 1.02,
-            neighbours: vec![Neighbour { subject: "12".into(), distance: 0.3 }],
+            neighbours: vec![Neighbour { subject: "12".into(), distance: 0.3, mahalanobis: 1.2, own_spread: 0.2, inside: false }],
             shape: None,
         };
         let dir = tempfile::tempdir().unwrap();

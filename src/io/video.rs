@@ -3,7 +3,7 @@
 //! Frame counts in file headers can be estimates, so [`count_frames`] decodes; a file that promises more than it holds
 //! was cut off. Checked against videos written by OpenCV and cut by hand.
 
-use image::GrayImage;
+use image::{GrayImage, RgbImage};
 use opencv::core::Mat;
 use opencv::prelude::*;
 use opencv::{imgproc, videoio};
@@ -78,6 +78,15 @@ impl Video {
 
     /// The next frame; `None` at the end.
     pub fn read_grey(&mut self) -> Result<Option<GrayImage>, VideoError> {
+        self.read(grey)
+    }
+
+    /// The next frame in colour; `None` at the end.
+    pub fn read_rgb(&mut self) -> Result<Option<RgbImage>, VideoError> {
+        self.read(rgb)
+    }
+
+    fn read<T>(&mut self, convert: fn(&Mat) -> opencv::Result<T>) -> Result<Option<T>, VideoError> {
         let frame = self.next;
         self.next += 1;
         let failed = |message: String| VideoError::Decode { path: self.path.clone(), frame, message };
@@ -85,8 +94,20 @@ impl Video {
         if !self.capture.read(&mut picture).map_err(|e| failed(e.message))? || picture.empty() {
             return Ok(None);
         }
-        grey(&picture).map_err(|e| failed(e.message)).map(Some)
+        convert(&picture).map_err(|e| failed(e.message)).map(Some)
     }
+}
+
+fn rgb(picture: &Mat) -> opencv::Result<RgbImage> {
+    let mut rgb = Mat::default();
+    let code = match picture.channels() {
+        1 => imgproc::COLOR_GRAY2RGB,
+        4 => imgproc::COLOR_BGRA2RGB,
+        _ => imgproc::COLOR_BGR2RGB,
+    };
+    imgproc::cvt_color_def(picture, &mut rgb, code)?;
+    RgbImage::from_raw(rgb.cols() as u32, rgb.rows() as u32, rgb.data_bytes()?.to_vec())
+        .ok_or_else(|| opencv::Error::new(opencv::core::StsUnmatchedFormats, "not 8 bits per channel"))
 }
 
 fn grey(picture: &Mat) -> opencv::Result<GrayImage> {

@@ -97,16 +97,18 @@ impl BandCholesky {
     pub fn solve(&self, right: &DMatrix<f64>) -> DMatrix<f64> {
         let l = &self.0;
         let mut x = right.clone();
-        for mut column in x.column_iter_mut() {
+        for column in x.as_mut_slice().chunks_exact_mut(l.size.max(1)) {
             for row in 0..l.size {
                 let first = row.saturating_sub(l.bandwidth);
-                let known: f64 = (first..row).map(|k| l.rows[l.index(row, k)] * column[k]).sum();
-                column[row] = (column[row] - known) / l.rows[l.index(row, row)];
+                let entries = &l.rows[l.index(row, first)..=l.index(row, row)];
+                column[row] = (column[row] - dot(&entries[..row - first], &column[first..row])) / entries[row - first];
             }
             for row in (0..l.size).rev() {
-                let last = (row + l.bandwidth).min(l.size - 1);
-                let known: f64 = (row + 1..=last).map(|k| l.rows[l.index(k, row)] * column[k]).sum();
-                column[row] = (column[row] - known) / l.rows[l.index(row, row)];
+                let first = row.saturating_sub(l.bandwidth);
+                let entries = &l.rows[l.index(row, first)..=l.index(row, row)];
+                let value = column[row] / entries[row - first];
+                column[row] = value;
+                column[first..row].iter_mut().zip(entries).for_each(|(c, e)| *c -= e * value);
             }
         }
         x

@@ -6,5 +6,7 @@ pub mod curves;
 pub mod distance_field;
 pub mod order;
 pub mod pca;
+pub mod rbf;
 pub mod rotation;
+pub mod spectrum;
 pub mod spline;

@@ -10,10 +10,12 @@ use image::{DynamicImage, ImageFormat, RgbImage};
 use crate::footage::board::BoardError;
 use crate::io::write_atomic;
 
+pub mod animal;
 pub mod board;
 pub mod calibration;
 pub mod canvas;
 pub mod clouds;
+pub mod clusters;
 pub mod curves;
 pub mod figures;
 pub mod maps;
@@ -21,7 +23,8 @@ pub mod overlay;
 pub mod rig;
 
 pub use calibration::calibration;
-pub use clouds::cloud_and_body;
+pub use clouds::{CloudDot, cloud_and_body};
+pub use clusters::clusters;
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::depth_map;

@@ -36,7 +36,7 @@ pub fn overlay(
     Ok(canvas.picture)
 }
 
-fn outlines(mask: &GrayImage, width: u32, height: u32) -> Result<Vector<Vector<Point>>, ReportError> {
+pub(super) fn outlines(mask: &GrayImage, width: u32, height: u32) -> Result<Vector<Vector<Point>>, ReportError> {
     // Enlarged smoothly and cut at one half: no stairs.
     let mut large = imageops::resize(mask, width, height, imageops::FilterType::Triangle);
     large.pixels_mut().for_each(|p| *p = Luma([if p[0] > 127 { 255 } else { 0 }]));

@@ -105,19 +105,35 @@ impl Population {
         curve.at(nearest) + &self.slope * (parameter - nearest)
     }
 
+    /// Subjects that take part at `parameter`; all where none does.
+    fn present(&self, parameter: f64) -> impl Iterator<Item = &Curve> {
+        let nobody = !self.curves.iter().any(|c| c.takes_part(parameter));
+        self.curves.iter().filter(move |c| nobody || c.takes_part(parameter))
+    }
+
     /// Distances from weights at `parameter` to the subjects that take part there (to all, extended, where none does),
     /// nearest first.
-    pub fn distances(&self, weights: &DVector<f64>, parameter: f64, metric: Metric) -> Vec<Neighbour> {
-        let nobody = !self.curves.iter().any(|c| c.takes_part(parameter));
-        let mut found: Vec<Neighbour> = self
-            .curves
-            .iter()
-            .filter(|c| nobody || c.takes_part(parameter))
-            .map(|c| {
-                let distance = metric.distance(&self.eigenvalues, weights, &self.extended(c, parameter));
-                Neighbour { subject: c.subject.clone(), distance }
-            })
-            .collect();
+    pub fn distances(&self, weights: &DVector<f64>, parameter: f64, metric: Metric) -> Vec<f64> {
+        let to = |c: &Curve| metric.distance(&self.eigenvalues, weights, &self.extended(c, parameter));
+        let mut found: Vec<f64> = self.present(parameter).map(to).collect();
+        found.sort_by(f64::total_cmp);
+        found
+    }
+
+    /// The same subjects with their distances and how far their own cycles lie from their curves, nearest first.
+    pub fn neighbours(&self, model: &Model, weights: &DVector<f64>, parameter: f64) -> Vec<Neighbour> {
+        let basis = model.basis.columns(0, self.components());
+        let to = |c: &Curve| {
+            let own = model.members.iter().filter(|m| m.subject == c.subject).map(|m| {
+                Metric::Paper.distance(&self.eigenvalues, &basis.tr_mul(&(&m.vector - &model.mean)), &self.extended(c, m.parameter))
+            });
+            let here = self.extended(c, parameter);
+            let distance = Metric::Paper.distance(&self.eigenvalues, weights, &here);
+            let own_spread = own.fold(0.0, f64::max);
+            let mahalanobis = Metric::Mahalanobis.distance(&self.eigenvalues, weights, &here);
+            Neighbour { subject: c.subject.clone(), distance, mahalanobis, own_spread, inside: distance <= own_spread }
+        };
+        let mut found: Vec<Neighbour> = self.present(parameter).map(to).collect();
         found.sort_by(|a, b| a.distance.total_cmp(&b.distance));
         found
     }

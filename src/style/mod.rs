@@ -18,14 +18,20 @@ use serde::{Deserialize, Serialize};
 use crate::body::Shape;
 use crate::motion_model::{Activity, Cycle, Model};
 
-/// How many nearest database subjects a style names.
-const NEIGHBOURS: usize = 5;
-
-/// A database subject and the distance of equation (6) to it.
+/// A database subject and the distance to it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Neighbour {
     pub subject: String,
+    /// Equation (6).
     pub distance: f64,
+    /// √(Σ (Δα_i)²/λ_i).
+    #[serde(default)]
+    pub mahalanobis: f64,
+    /// The largest distance (6) of the subject's own cycles to its curve, and whether this person is within it.
+    #[serde(default)]
+    pub own_spread: f64,
+    #[serde(default)]
+    pub inside: bool,
 }
 
 /// One person's style as observed once.
@@ -44,7 +50,7 @@ pub struct Style {
     pub covariance: Option<Vec<Vec<f64>>>,
     /// Observed cycle frequency over the model's law at this parameter.
     pub cadence_factor: f64,
-    /// Nearest database subjects that move at this parameter, nearest first.
+    /// Database subjects that move at this parameter, nearest first.
     pub neighbours: Vec<Neighbour>,
     /// Body size where the observation gave one.
     pub shape: Option<Shape>,
@@ -61,8 +67,7 @@ impl Style {
         frequency_hz: f64,
     ) -> Style {
         let population = Population::new(model, weights.len());
-        let mut neighbours = population.distances(weights, parameter, Metric::Paper);
-        neighbours.truncate(NEIGHBOURS);
+        let neighbours = population.neighbours(model, weights, parameter);
         Style {
             activity: model.activity,
             model_hash: model_hash.to_string(),

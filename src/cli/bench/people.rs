@@ -102,6 +102,7 @@ fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
     subsets.extend(order[1..].iter().map(|&other| vec![order[0], other]));
     let name = folder.file_name().unwrap_or_default().to_string_lossy();
     let mut together: Vec<FrameCloud> = Vec::new();
+    let mut off: Vec<f64> = Vec::new();
     for cameras in subsets {
         let rig = Rig { cameras: cameras.iter().map(|&k| session.rig.cameras[k].clone()).collect(), up: session.rig.up };
         let stage: Vec<GrayImage> = cameras.iter().map(|&k| stages[k].clone()).collect();
@@ -133,9 +134,16 @@ fn bench(folder: &Path, pictures: Option<&Path>) -> Result<()> {
             }
         }
         println!("{}", ours.row(&name, &format!("ours {label}")));
+        off.push(ours.kept_off as f64 / ours.kept.max(1) as f64);
         if cameras.len() == 2 {
             println!("{}", sgbm.row(&name, &format!("StereoSGBM {label}")));
         }
+    }
+    if let [all, pairs @ ..] = &off[..]
+        && order.len() > 2
+    {
+        let pairs = pairs.iter().sum::<f64>() / pairs.len() as f64;
+        println!("{name:<22}points kept off by more than 1 px: all views / mean of the pairs {:.2}", all / pairs);
     }
     Ok(())
 }

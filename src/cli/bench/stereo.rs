@@ -5,9 +5,9 @@
 
 use super::super::interrupt;
 use anyhow::{Context, Result, ensure};
-use muybridge::clouds::correlate::Region;
-use muybridge::clouds::stereo::{StereoOptions, StereoView, match_view};
+use muybridge::clouds::stereo::{StereoOptions, StereoView, disparity_map};
 use muybridge::rig::rectify::Plane;
+use nalgebra::{Matrix2, Vector2};
 use opencv::calib3d::{StereoBM, StereoSGBM, StereoSGBM_MODE_SGBM, StereoSGBM_MODE_SGBM_3WAY};
 use opencv::core::{Mat, transpose};
 use opencv::imgcodecs::{IMREAD_GRAYSCALE, IMREAD_UNCHANGED, imread};
@@ -20,7 +20,7 @@ pub struct StereoArgs {
     /// Folder with Middlebury scenes: view1.png, view5.png, disp1.png, disp5.png or im2.png, im6.png, disp2, disp6 each
     folder: PathBuf,
     /// Rounds of each time measurement
-    #[arg(long, default_value_t = 15, value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, default_value_t = 40, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
 }
 
@@ -41,7 +41,8 @@ struct Scene {
     right: PathBuf,
     /// A third view at twice the baseline.
     third: Option<PathBuf>,
-    /// The left view's disparities and, if known, the right's; pixels are value / scale.
+    /// The left view's disparities and, if known, the right's (else what is hidden follows from the left's); pixels are
+    /// value / scale.
     truth: [Option<PathBuf>; 2],
     scale: f32,
 }
@@ -130,13 +131,28 @@ fn score(found: &[f32], truth: &[f32], counts: &[bool]) -> Score {
     }
 }
 
-/// Pixels whose truth both views share; all known ones where the right view's truth is not given.
-fn visible(truth: &[f32], right: Option<&[f32]>, width: usize) -> Vec<bool> {
-    let shared = |i: usize, right: &[f32]| {
-        let x = (i % width) as f32 - truth[i];
-        x.round() >= 0.0 && (right[i / width * width + x.round() as usize] - truth[i]).abs() <= 1.0
+/// Pixels whose truth the right view shares, and which lie in it.
+fn visible(truth: &[f32], right: &[f32], width: usize) -> Vec<bool> {
+    let shared = |i: usize| {
+        let x = ((i % width) as f32 - truth[i]).round();
+        x >= 0.0 && (right[i / width * width + x as usize] - truth[i]).abs() <= 1.0
     };
-    (0..truth.len()).map(|i| truth[i] > 0.0 && right.is_none_or(|right| shared(i, right))).collect()
+    (0..truth.len()).map(|i| truth[i] > 0.0 && shared(i)).collect()
+}
+
+/// Disparities that the right view has where the left's truth leads, the nearest wherever several pixels meet; 0 where none.
+fn seen_from_right(truth: &[f32], width: usize) -> Vec<f32> {
+    let mut right = vec![0.0f32; truth.len()];
+    for (truth, right) in truth.chunks_exact(width).zip(right.chunks_exact_mut(width)) {
+        for (x, &d) in truth.iter().enumerate().filter(|(_, d)| **d > 0.0) {
+            let place = x as f32 - d;
+            // A surface seen more slantwise from the left leaves gaps: both neighbours of its place are covered.
+            for place in [place.floor(), place.ceil()].into_iter().filter(|p| *p >= 0.0) {
+                right[place as usize] = right[place as usize].max(d);
+            }
+        }
+    }
+    right
 }
 
 /// Prints the table; how many comparisons fall short.
@@ -159,7 +175,8 @@ fn accuracy(scenes: &[Scene]) -> Result<usize> {
             "{}: the truth has another size than the views",
             scene.left.display()
         );
-        let counts = visible(&truth, known(&scene.truth[1])?.as_deref(), left.width);
+        let right_truth = known(&scene.truth[1])?.unwrap_or_else(|| seen_from_right(&truth, left.width));
+        let counts = visible(&truth, &right_truth, left.width);
         let disparities = (truth.iter().copied().fold(0.0, f32::max) as usize / 16 + 1) * 16;
         let views = [view(left.plane()?, [0.0, 0.0]), view(right.plane()?, [-1.0, 0.0])];
         let two = ours(&views, disparities);
@@ -197,10 +214,8 @@ fn view(plane: Plane, step: [f64; 2]) -> StereoView {
 
 /// Our disparities of the first view, 0 where there is none.
 fn ours(views: &[StereoView], disparities: usize) -> Vec<f32> {
-    let (width, height) = views[0].plane.dimensions();
-    let all = Region { x: [0, width as usize], y: [0, height as usize] };
-    let found = match_view(views, 0, all, [0, disparities - 1], &StereoOptions::default());
-    found.disparity.iter().map(|d| if d.is_nan() { 0.0 } else { *d }).collect()
+    let found = disparity_map(views, [0, disparities - 1], &StereoOptions::default());
+    found.iter().map(|d| if d.is_nan() { 0.0 } else { *d }).collect()
 }
 
 /// OpenCV's matchers, with the same checks.
@@ -258,7 +273,7 @@ impl Triple {
             Plane::from_fn(width, height, |x, y| {
                 let (x, y) = (f64::from(x), f64::from(y));
                 let at = |d: f64| (x - step[0] * d, y - step[1] * d);
-                let ((u, v), (wall_u, wall_v)) = (at(40.0), at(14.0));
+                let ((u, v), (wall_u, wall_v)) = (at(24.0), at(14.0));
                 let inside = (u / w - 0.5).abs() < 0.2 && (v / h - 0.5).abs() < 0.35;
                 image::Luma([(if inside { texture(u + 500.0, v) } else { texture(wall_u, wall_v) }).round() as f32])
             })
@@ -301,9 +316,7 @@ fn fastest<const N: usize>(rounds: usize, mut contestants: [&mut dyn FnMut() -> 
 }
 
 fn matched(views: &[StereoView], disparities: usize, radius: usize) -> Result<()> {
-    let (width, height) = views[0].plane.dimensions();
-    let all = Region { x: [0, width as usize], y: [0, height as usize] };
-    std::hint::black_box(match_view(views, 0, all, [0, disparities - 1], &StereoOptions { radius, ..StereoOptions::default() }));
+    std::hint::black_box(disparity_map(views, [0, disparities - 1], &StereoOptions { radius, ..StereoOptions::default() }));
     Ok(())
 }
 
@@ -339,20 +352,65 @@ fn times(rounds: usize) -> Result<()> {
     println!("{:<44}{pair:>8.1}", "ours, two views");
     println!("{:<44}{two_bm:>8.1}   ours takes {:.2} of it", "OpenCV, two StereoBM maps", three / two_bm);
     println!("{:<44}{semi_global:>8.1}   ours takes {:.2} of it", "OpenCV, one StereoSGBM map (3WAY)", three / semi_global);
-    println!("\nours, three views, one thread: ns per pixel and disparity");
-    let per = |width: u32, height: u32, disparities: usize, radius: usize| -> Result<f64> {
+    println!();
+    growth(rounds.div_ceil(3), &one)
+}
+
+/// How the time of three views in an L grows with pixels, disparities and windows.
+fn growth(rounds: usize, one: &rayon::ThreadPool) -> Result<()> {
+    println!("ours, three views in an L, one thread{:>15}{:>14}", "ms", "ns per pixel");
+    let row = |width: u32, height: u32, disparities: usize, radius: usize| -> Result<f64> {
         let views = Triple::new(width, height).l_shape();
-        let [ms] = fastest(rounds.div_ceil(3), [&mut || one.install(|| matched(&views, disparities, radius))])?;
-        Ok(1e6 * ms / f64::from(width * height) / disparities as f64)
+        let [ms] = fastest(rounds, [&mut || one.install(|| matched(&views, disparities, radius))])?;
+        let per_pixel_ns = 1e6 * ms / f64::from(width * height);
+        let title = format!("{width}x{height}, {disparities} disparities, window {}", 2 * radius + 1);
+        println!("{title:<44}{ms:>8.1}{per_pixel_ns:>14.1}");
+        Ok(per_pixel_ns)
     };
     for (width, height) in [(320, 240), (640, 480), (1280, 960)] {
-        println!("{:<44}{:>8.3}", format!("{width}x{height}, 64 disparities, window 5"), per(width, height, 64, 2)?);
+        row(width, height, 64, 2)?;
     }
-    for disparities in [32, 64, 128, 256] {
-        println!("{:<44}{:>8.3}", format!("640x480, {disparities} disparities, window 5"), per(640, 480, disparities, 2)?);
-    }
-    for radius in [1, 2, 3, 5, 7] {
-        println!("{:<44}{:>8.3}", format!("640x480, 64 disparities, window {}", 2 * radius + 1), per(640, 480, 64, radius)?);
-    }
+    let by_disparities: Vec<[f64; 2]> =
+        [32, 64, 128, 256].into_iter().map(|d| Ok([d as f64, row(640, 480, d, 2)?])).collect::<Result<_>>()?;
+    let by_window: Vec<f64> = [1, 2, 3, 5, 7].into_iter().map(|radius| row(640, 480, 64, radius)).collect::<Result<_>>()?;
+    let (fixed, each) = line(&by_disparities);
+    let off = by_disparities.iter().map(|[d, t]| (fixed + each * d - t).abs() / t).fold(0.0, f64::max);
+    println!("per pixel {fixed:.1} ns and {each:.3} ns per disparity, within {:.0} % of each of the four", 100.0 * off);
+    let slowest = by_window.iter().copied().fold(0.0, f64::max);
+    let quickest = by_window.iter().copied().fold(f64::INFINITY, f64::min);
+    println!("from window 3 to 15 within {:.0} %", 100.0 * (slowest / quickest - 1.0));
     Ok(())
+}
+
+/// Offset and slope of the line through (x, y) with the least squared errors relative to y.
+fn line(points: &[[f64; 2]]) -> (f64, f64) {
+    let (mut normal, mut right) = (Matrix2::zeros(), Vector2::zeros());
+    for [x, y] in points {
+        let row = Vector2::new(1.0, *x) / *y;
+        normal += row * row.transpose();
+        right += row;
+    }
+    let solution = normal.try_inverse().map_or(right, |inverse| inverse * right);
+    (solution.x, solution.y)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_near_surface_hides_from_the_right_view_does_not_count() {
+        // A near strip of disparity 5 at 10..14 before a wall of 2: the right view has it at 5..9, so the wall's 7 to 9 are hidden
+        // behind it (seen at 5 to 7) with nothing between, and 0 and 1 leave the picture.
+        let truth: Vec<f32> = (0..20).map(|x| if (10..14).contains(&x) { 5.0 } else { 2.0 }).collect();
+        let counts = visible(&truth, &seen_from_right(&truth, 20), 20);
+        let hidden: Vec<usize> = (0..20).filter(|x| !counts[*x]).collect();
+        assert_eq!(hidden, [0, 1, 7, 8, 9]);
+    }
+
+    #[test]
+    fn a_line_is_found_again() {
+        let (offset, slope) = line(&[32.0, 64.0, 128.0, 256.0].map(|x| [x, 15.0 + 0.25 * x]));
+        assert!((offset - 15.0).abs() < 1e-9 && (slope - 0.25).abs() < 1e-9);
+    }
 }

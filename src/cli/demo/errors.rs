@@ -123,7 +123,7 @@ fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row>
     let repeats: Vec<_> = (0..REPEATS).map(|r| weights(&truth.subject.cycle(SPEED_M_S, r))).collect();
     let pairs: Vec<f64> =
         (0..repeats.len()).flat_map(|i| (0..i).map(move |k| (i, k))).map(|(i, k)| distance(&repeats[i], &repeats[k])).collect();
-    let people: Vec<f64> = population.distances(&own, SPEED_M_S, Metric::Paper).into_iter().map(|n| n.distance).collect();
+    let people: Vec<f64> = population.distances(&own, SPEED_M_S, Metric::Paper);
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
     vec![
         Row::new("weights, equation (6)", distance(&found, &own), "")

@@ -120,7 +120,7 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
     let generated = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
     let rows = clock.time("errors and pictures", || {
         let rows = errors::rows(&truth, &model, &tracked, &generated)?;
-        track::draw(&folder.join("pictures"), &session.rig, &tracked)?;
+        track::draw(&folder.join("pictures"), &session.rig, &model, &tracked)?;
         pictures::draw(&folder.join("pictures"), &truth, &model, &tracked, &generated, depth.as_ref())?;
         Ok(rows)
     })?;
@@ -223,7 +223,7 @@ fn replace(output: &Path, partial: TempDir) -> Result<()> {
 fn where_to_look(output: &Path) {
     println!("\nThe person is synthetic and so is the model; the footage was rendered with a known truth. Look at");
     for (path, what) in [
-        ("pictures/overlay.png", "the recovered skeleton over the footage"),
+        ("pictures/overlay_cam_00.png", "the recovered skeleton over the footage"),
         ("pictures/cloud.png", "a point cloud with the recovered body"),
         ("pictures/depth.png", "depths measured in one frame"),
         ("pictures/angles.png", "recovered and true joint angles over the cycle"),

@@ -40,7 +40,7 @@ fn angles(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Result<image:
     // The knee bends backwards: turns the other way about the axis to the left.
     for (colour, (name, joint, sign)) in [("hip", Joint::RHip, -1.0), ("knee", Joint::RKnee, 1.0)].into_iter().enumerate() {
         for (label, cycle, dashed) in [("recovered", &found, false), ("true", &truth.cycle, true)] {
-            series.push(Curve { label: format!("{name}, {label}"), points: flexion(cycle, joint, sign), dashed, colour });
+            series.push(Curve { label: format!("{name}, {label}"), points: flexion(cycle, joint, sign), dashed, colour, band: Vec::new() });
         }
     }
     Ok(report::curves("Right leg over the cycle", "cycle from the right heel strike (%)", "flexion (degrees)", &series)?)
