@@ -288,19 +288,26 @@ impl Evaluation {
 
     /// √d_eff, continued by its tangent deep inside.
     pub fn root(&self) -> f64 {
-        let shallow = self.d_eff.max(DEEP).sqrt();
-        shallow + (self.d_eff - self.d_eff.max(DEEP)) * self.root_slope()
+        root(self.d_eff)
     }
 
     /// Derivative of [`root`](Self::root) for d_eff.
     pub fn root_slope(&self) -> f64 {
-        0.5 / self.d_eff.max(DEEP).sqrt()
+        root_slope(self.d_eff)
     }
 
     /// 1/|∇√d_eff|, the factor that the fit freezes, metres.
     pub fn metres_per_root(&self) -> f64 {
         1.0 / (self.root_slope() * self.gradient.norm()).max(1e-6)
     }
+}
+
+fn root(d_eff: f64) -> f64 {
+    d_eff.max(DEEP).sqrt() + (d_eff - d_eff.max(DEEP)) * root_slope(d_eff)
+}
+
+fn root_slope(d_eff: f64) -> f64 {
+    0.5 / d_eff.max(DEEP).sqrt()
 }
 
 impl PosedSurface {
@@ -369,13 +376,26 @@ impl PosedSurface {
         into.gradient = Vector3::zeros();
         for share in &mut into.shares {
             let weight = (-2.0 * (share.unit.norm_squared() - nearest)).exp();
-            share.force = self.primitives[share.primitive].unit_from_world.tr_mul(&share.unit) * (2.0 * weight);
+            share.force = self.primitives[share.primitive].unit_from_world.transpose() * share.unit * (2.0 * weight);
             sum += weight;
             into.gradient += share.force;
         }
         into.gradient /= sum;
         into.shares.iter_mut().for_each(|share| share.force /= sum);
         into.d_eff = nearest - 0.5 * sum.ln();
+    }
+
+    /// [`Evaluation::root`] of some primitives alone, without the gradient.
+    pub fn root_among(&self, near: &Near, x: &Vector3<f64>) -> f64 {
+        let mut distances = [0.0; MOST_NEAR];
+        let mut nearest = f64::INFINITY;
+        for (distance, primitive) in distances.iter_mut().zip(near.indices()) {
+            let p = &self.primitives[primitive];
+            *distance = (p.unit_from_world * (x - p.centre)).norm_squared();
+            nearest = nearest.min(*distance);
+        }
+        let sum: f64 = distances[..near.count as usize].iter().map(|d| (-2.0 * (d - nearest)).exp()).sum();
+        root(nearest - 0.5 * sum.ln())
     }
 
     pub fn evaluate(&self, x: &Vector3<f64>) -> Evaluation {
@@ -401,19 +421,18 @@ impl PosedSurface {
 }
 
 impl PosedPrimitive {
-    /// Velocity in the world of the material at `unit` when its limb's length factor, now `length`, grows by one per second,
-    /// relative to its node.
-    pub fn length_velocity(&self, unit: &Vector3<f64>, length: f64) -> Vector3<f64> {
-        let mut in_node = self.centre_in_node;
-        in_node[self.axis] += self.semi_axes[self.axis] * unit[self.axis];
-        self.world_from_node * in_node / length
+    /// Velocity in the node frame of the material at `unit` when its limb lengthens by its own length per second.
+    pub fn lengthening(&self, unit: &Vector3<f64>) -> Vector3<f64> {
+        let mut velocity = self.centre_in_node;
+        velocity[self.axis] += self.semi_axes[self.axis] * unit[self.axis];
+        velocity
     }
 
-    /// The same for the width factor.
-    pub fn width_velocity(&self, unit: &Vector3<f64>, width: f64) -> Vector3<f64> {
-        let mut in_node = self.semi_axes.component_mul(unit);
-        in_node[self.axis] = 0.0;
-        self.world_from_node * in_node / width
+    /// The same when it widens by its own width per second.
+    pub fn widening(&self, unit: &Vector3<f64>) -> Vector3<f64> {
+        let mut velocity = self.semi_axes.component_mul(unit);
+        velocity[self.axis] = 0.0;
+        velocity
     }
 }
 
@@ -540,8 +559,8 @@ mod tests {
                         .filter(|s| before.primitives[s.primitive].limb == limb)
                         .map(|s| {
                             let b = &before.primitives[s.primitive];
-                            let v = if lengthen { b.length_velocity(&s.unit, 1.0) } else { b.width_velocity(&s.unit, 1.0) };
-                            -s.force.dot(&v)
+                            let v = if lengthen { b.lengthening(&s.unit) } else { b.widening(&s.unit) };
+                            -s.force.dot(&(b.world_from_node * v))
                         })
                         .sum();
                     assert!((numeric - analytic).abs() < 1e-5 * (1.0 + numeric.abs()), "{limb:?} {lengthen} {numeric} {analytic}");

@@ -120,6 +120,8 @@ pub struct Problem<'a> {
 
 /// Precision of the floor times the share of new information per primitive: 15 mm, 0.3.
 const SUNKEN_WEIGHT: f64 = 0.3 / (0.015 * 0.015);
+/// Frames whose normal equations are held at the same time; bounds the memory of long sequences.
+const AT_ONCE: usize = 64;
 
 /// Precision of what may not move: its variance is nought.
 const PINNED: f64 = 1e24;
@@ -138,7 +140,7 @@ impl<'a> Problem<'a> {
     }
 
     /// The residuals of each frame as frozen.
-    pub(super) fn frozen(&self) -> &[Vec<Frozen>] {
+    pub fn frozen(&self) -> &[Vec<Frozen>] {
         &self.frozen
     }
 
@@ -150,7 +152,7 @@ impl<'a> Problem<'a> {
         pull.clear();
         pull.force(p.node as usize, &p.centre, force);
         pull.size(0, force.dot(&(p.centre - state.carriers[frame].position)));
-        let growth = p.length_velocity(&Vector3::zeros(), state.shape.lengths[p.limb as usize]);
+        let growth = p.world_from_node * p.lengthening(&Vector3::zeros()) / state.shape.lengths[p.limb as usize];
         pull.size(size(layout.length(p.limb)), force.dot(&growth));
     }
 
@@ -170,8 +172,9 @@ impl<'a> Problem<'a> {
             pull.force(p.node as usize, &frozen.x, &share.force);
             let limb = p.limb as usize;
             let (length, width) = (state.shape.lengths[limb], state.shape.widths[limb]);
-            pull.size(size(layout.length(p.limb)), share.force.dot(&p.length_velocity(&share.unit, length)));
-            pull.size(size(layout.width(p.limb)), share.force.dot(&p.width_velocity(&share.unit, width)));
+            let in_node = p.world_from_node.transpose() * share.force;
+            pull.size(size(layout.length(p.limb)), in_node.dot(&p.lengthening(&share.unit)) / length);
+            pull.size(size(layout.width(p.limb)), in_node.dot(&p.widening(&share.unit)) / width);
         }
         pull.size(0, force.dot(&(frozen.x - state.carriers[frame].position)));
         (frozen.metres_per_root * (e.root() - SKIN.sqrt()), -frozen.metres_per_root * e.root_slope())
@@ -211,7 +214,12 @@ impl<'a> Problem<'a> {
                 gathered.add(residual, SUNKEN_WEIGHT, 1.0, &mut scratch.pull);
             }
         }
-        gathered.expand(&motion, state.layout())
+        gathered.expand(&motion, state.layout(), self.moving(state.layout()))
+    }
+
+    /// How many of the unknowns can move a frame: the posture, last of them, is often pinned.
+    fn moving(&self, layout: Layout) -> usize {
+        if self.free.posture { layout.size() } else { layout.local + layout.posture(0) }
     }
 
     /// The silhouettes of a frame with their frozen quantities, one per primitive.
@@ -224,10 +232,8 @@ impl<'a> Problem<'a> {
 
     fn frame_cost(&self, state: &State, surface: &Surface, frame: usize) -> f64 {
         let posed = state.posed(self.curve, surface, frame);
-        let mut evaluation = Evaluation::default();
         let squares = self.frozen[frame].iter().filter(|f| f.weight > 0.0).map(|f| {
-            posed.surface.evaluate_among(&f.near, &f.x, &mut evaluation);
-            let r = f.metres_per_root * (evaluation.root() - SKIN.sqrt());
+            let r = f.metres_per_root * (posed.surface.root_among(&f.near, &f.x) - SKIN.sqrt());
             0.5 * f.weight * r * r
         });
         let points: f64 = squares.sum();
@@ -401,11 +407,13 @@ impl ArrowProblem for Problem<'_> {
 
     fn linearise(&self, state: &State) -> NormalEquations {
         let surface = Surface::new(&state.shape);
-        let frames: Vec<FrameNormal> = (0..self.frames.len()).into_par_iter().map(|t| self.frame_normal(state, &surface, t)).collect();
         let layout = state.layout();
-        let mut normal = NormalEquations::zeros(layout.local * frames.len(), 3 * layout.local - 1, layout.shared());
-        for (t, frame) in frames.iter().enumerate() {
-            frame.scatter(t, layout.local, &mut normal);
+        let count = self.frames.len();
+        let mut normal = NormalEquations::zeros(layout.local * count, 3 * layout.local - 1, layout.shared());
+        for first in (0..count).step_by(AT_ONCE) {
+            let some = first..count.min(first + AT_ONCE);
+            let frames: Vec<FrameNormal> = some.into_par_iter().map(|t| self.frame_normal(state, &surface, t)).collect();
+            frames.iter().zip(first..).for_each(|(frame, t)| frame.scatter(t, layout.local, &mut normal));
         }
         for (i, r, slope) in self.shared_priors(state) {
             normal.cost += 0.5 * r * r;
@@ -546,7 +554,7 @@ pub(super) mod tests {
             let factor = Problem::residual(&motion, &state, 1, frozen, &mut scratch).1;
             let mut gathered = Gathered::new();
             gathered.add(1.0, 1.0, factor, &mut scratch.pull);
-            let row = gathered.expand(&motion, layout).gradient;
+            let row = gathered.expand(&motion, layout, layout.size()).gradient;
             for (i, analytic) in row.iter().enumerate() {
                 let at = |h: f64| {
                     let (mut y, mut z) = (vec![0.0; 3 * layout.local], vec![0.0; layout.shared()]);

@@ -14,7 +14,7 @@ use crate::body::{PosedSurface, Surface};
 
 /// Frozen quantities of one target.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Frozen {
+pub struct Frozen {
     pub x: Vector3<f64>,
     /// The primitives that count.
     pub near: Near,

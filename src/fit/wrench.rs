@@ -9,12 +9,12 @@
 
 use nalgebra::Vector3;
 
-use super::state::{Layout, Motion, SIZES, Twist};
+use super::state::{Layout, Motion, SIZES};
 use crate::body::NODES;
 use crate::math::arrow::NormalEquations;
 
-/// Wrenches of all nodes, then stature, lengths and widths.
-const WIDTH: usize = 6 * NODES + SIZES;
+/// Pairs of nodes, the lower half.
+const PAIRS: usize = NODES * (NODES + 1) / 2;
 /// More nodes than make the skin at any point.
 const MOST_NODES: usize = 16;
 
@@ -63,16 +63,32 @@ impl Pull {
 /// Half the sum of ω r², its gradient and Gauss–Newton Hessian over wrenches and sizes.
 pub(super) struct Gathered {
     cost: f64,
-    gradient: Vec<f64>,
-    /// Rows of WIDTH; node blocks below the diagonal only, and the rows of the sizes.
-    hessian: Vec<f64>,
+    gradient: [[f64; 6]; NODES],
+    size_gradient: [f64; SIZES],
+    /// Blocks of nodes i ≥ j at [`pair`]; rows are those of i.
+    blocks: Vec<[[f64; 6]; 6]>,
+    /// Sizes against wrenches, and against sizes.
+    size_nodes: Vec<[[f64; 6]; NODES]>,
+    size_sizes: [[f64; SIZES]; SIZES],
     /// Bit j of entry i ≥ j: nodes i and j have met.
     met: [u32; NODES],
 }
 
+fn pair(i: usize, j: usize) -> usize {
+    i * (i + 1) / 2 + j
+}
+
 impl Gathered {
     pub fn new() -> Gathered {
-        Gathered { cost: 0.0, gradient: vec![0.0; WIDTH], hessian: vec![0.0; WIDTH * WIDTH], met: [0; NODES] }
+        Gathered {
+            cost: 0.0,
+            gradient: [[0.0; 6]; NODES],
+            size_gradient: [0.0; SIZES],
+            blocks: vec![[[0.0; 6]; 6]; PAIRS],
+            size_nodes: vec![[[0.0; 6]; NODES]; SIZES],
+            size_sizes: [[0.0; SIZES]; SIZES],
+            met: [0; NODES],
+        }
     }
 
     /// Adds ½ weight r² with r's derivative `factor` times the pull.
@@ -82,32 +98,41 @@ impl Gathered {
         let nodes = &mut pull.nodes[..pull.count];
         nodes.sort_unstable_by_key(|n| n.0);
         for (i, (a, of_a)) in nodes.iter().enumerate() {
-            (0..6).for_each(|r| self.gradient[6 * a + r] += weight * residual * of_a[r]);
+            add_scaled(&mut self.gradient[*a], weight * residual, of_a);
             for (b, of_b) in &nodes[..=i] {
                 self.met[*a] |= 1 << b;
-                for (r, v) in of_a.iter().enumerate() {
-                    let scaled = weight * v;
-                    let row = &mut self.hessian[(6 * a + r) * WIDTH + 6 * b..][..6];
-                    row.iter_mut().zip(of_b).for_each(|(h, w)| *h += scaled * w);
-                }
+                let block = &mut self.blocks[pair(*a, *b)];
+                block.iter_mut().zip(of_a).for_each(|(row, v)| add_scaled(row, weight * v, of_b));
             }
         }
         for (a, value) in &pull.sizes {
-            let (a, scaled) = (6 * NODES + a, weight * value);
-            self.gradient[a] += residual * scaled;
-            for (b, of_b) in nodes.iter() {
-                let row = &mut self.hessian[a * WIDTH + 6 * b..][..6];
-                row.iter_mut().zip(of_b).for_each(|(h, w)| *h += scaled * w);
-            }
-            for (b, other) in &pull.sizes {
-                self.hessian[a * WIDTH + 6 * NODES + b] += scaled * other;
-            }
+            let scaled = weight * value;
+            self.size_gradient[*a] += residual * scaled;
+            let of_nodes = &mut self.size_nodes[*a];
+            nodes.iter().for_each(|(b, of_b)| add_scaled(&mut of_nodes[*b], scaled, of_b));
+            let of_sizes = &mut self.size_sizes[*a];
+            pull.sizes.iter().for_each(|(b, other)| of_sizes[*b] += scaled * other);
         }
     }
 
-    /// The same over the unknowns: Tᵀ M T.
-    pub fn expand(&self, motion: &Motion, layout: Layout) -> FrameNormal {
-        let size = layout.size();
+    /// The same over the first `size` unknowns: Tᵀ M T.
+    pub fn expand(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.expand_avx2(motion, layout, size) };
+        }
+        self.expand_with(motion, layout, size)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn expand_avx2(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
+        self.expand_with(motion, layout, size)
+    }
+
+    #[inline(always)]
+    fn expand_with(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
         let first_size = layout.local + layout.stature();
         let mut normal = FrameNormal { cost: self.cost, hessian: vec![0.0; size * size], gradient: vec![0.0; size] };
         let mut product = vec![0.0; 6 * size];
@@ -115,50 +140,52 @@ impl Gathered {
         for (i, twist) in motion.twists.iter().enumerate().filter(|(i, _)| met(*i, *i)) {
             product.fill(0.0);
             for (j, other) in motion.twists.iter().enumerate().filter(|(j, _)| met(i, *j)) {
-                self.times(i, j, other, size, &mut product);
+                for (r, row) in product.chunks_exact_mut(size).enumerate() {
+                    add_six(row, &self.block_row(i, j, r), std::array::from_fn(|c| &other.row(c)[..size]));
+                }
             }
-            for r in 0..6 {
-                let sizes = &mut product[r * size + first_size..][..SIZES];
-                sizes.iter_mut().enumerate().for_each(|(d, p)| *p += self.hessian[(6 * NODES + d) * WIDTH + 6 * i + r]);
-                let row = twist.row(r);
-                add_scaled(&mut normal.gradient, self.gradient[6 * i + r], row);
-                for (a, t) in row.iter().enumerate().filter(|(_, t)| **t != 0.0) {
-                    add_scaled(&mut normal.hessian[a * size..=a * size + a], *t, &product[r * size..]);
+            for (r, row) in product.chunks_exact_mut(size).enumerate() {
+                row[first_size..].iter_mut().zip(&self.size_nodes).for_each(|(p, of_nodes)| *p += of_nodes[i][r]);
+                add_scaled(&mut normal.gradient, self.gradient[i][r], twist.row(r));
+            }
+            for (a, row) in normal.hessian.chunks_exact_mut(size).enumerate() {
+                let factors: [f64; 6] = std::array::from_fn(|r| twist.row(r)[a]);
+                if factors != [0.0; 6] {
+                    add_six(&mut row[..=a], &factors, std::array::from_fn(|r| &product[r * size..=r * size + a]));
                 }
             }
         }
         for d in 0..SIZES {
-            let (from, a) = (6 * NODES + d, first_size + d);
-            normal.gradient[a] += self.gradient[from];
+            let a = first_size + d;
+            normal.gradient[a] += self.size_gradient[d];
             let row = &mut normal.hessian[a * size..=a * size + a];
-            for (j, twist) in motion.twists.iter().enumerate() {
-                for r in 0..6 {
-                    let pair = self.hessian[from * WIDTH + 6 * j + r];
-                    if pair != 0.0 {
-                        add_scaled(row, pair, twist.row(r));
-                    }
-                }
+            for (pairs, twist) in self.size_nodes[d].iter().zip(&motion.twists).filter(|(pairs, _)| **pairs != [0.0; 6]) {
+                add_six(row, pairs, std::array::from_fn(|r| &twist.row(r)[..=a]));
             }
-            let sizes = &self.hessian[from * WIDTH + 6 * NODES..];
-            row[first_size..].iter_mut().zip(sizes).for_each(|(h, s)| *h += s);
+            add_scaled(&mut row[first_size..], 1.0, &self.size_sizes[d]);
         }
         normal
     }
 
-    /// Adds block (i, j) of M times the twist of j.
-    fn times(&self, i: usize, j: usize, twist: &Twist, size: usize, product: &mut [f64]) {
-        for r in 0..6 {
-            for c in 0..6 {
-                let at = if i >= j { (6 * i + r) * WIDTH + 6 * j + c } else { (6 * j + c) * WIDTH + 6 * i + r };
-                add_scaled(&mut product[r * size..][..size], self.hessian[at], twist.row(c));
-            }
-        }
+    /// Row `r` of block (i, j) of M.
+    fn block_row(&self, i: usize, j: usize, r: usize) -> [f64; 6] {
+        if i >= j { self.blocks[pair(i, j)][r] } else { self.blocks[pair(j, i)].map(|row| row[r]) }
     }
 }
 
 /// sum += factor · row, as far as `sum` goes.
+#[inline(always)]
 fn add_scaled(sum: &mut [f64], factor: f64, row: &[f64]) {
     sum.iter_mut().zip(row).for_each(|(s, v)| *s += factor * v);
+}
+
+/// The same of six rows as long as `sum`, one after the other.
+#[inline(always)]
+fn add_six(sum: &mut [f64], factors: &[f64; 6], rows: [&[f64]; 6]) {
+    let rows = rows.map(|row| &row[..sum.len()]);
+    for (i, s) in sum.iter_mut().enumerate() {
+        *s = (0..6).fold(*s, |s, r| s + factors[r] * rows[r][i]);
+    }
 }
 
 /// Normal equations of one frame over its own and the shared unknowns.
@@ -237,7 +264,7 @@ mod tests {
                 (0..size).for_each(|b| expected[a * size + b] += weight * row[a] * row[b]);
             }
         }
-        let found = gathered.expand(&motion, layout);
+        let found = gathered.expand(&motion, layout, size);
         let largest = expected.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         for a in 0..size {
             assert!((found.gradient[a] - gradient[a]).abs() < 1e-11 * largest, "{a}");
