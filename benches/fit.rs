@@ -10,8 +10,9 @@ use std::time::Instant;
 
 use muybridge::body::surface::Evaluation;
 use muybridge::body::{Joint, Length, PosedSurface, Shape, Surface};
+use muybridge::fit::SETTINGS;
 use muybridge::fit::curve::Curve;
-use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
+use muybridge::fit::problem::{Frame, Free, Known, Problem, Target};
 use muybridge::fit::state::{Carrier, State, Turns};
 use muybridge::math::arrow::{ArrowProblem, LmOptions, minimise};
 use muybridge::math::rotation::exp;
@@ -24,24 +25,6 @@ use rayon::prelude::*;
 const NOISE_M: f64 = 0.005;
 const FREE: Free = Free { rotation: true, phase: true, weights: true, stature: true, lengths: true, widths: true, posture: false };
 const KNOWN: Known = Known { viewpoint: Vector3::new(0.0, 1.2, -6.0), up: Vector3::new(0.0, 1.0, 0.0), stature_m: 1.75, floor_m: None };
-/// Those of the last stages of a fit.
-const SETTINGS: Settings = Settings {
-    model_m: 0.02,
-    point_weight: 0.16,
-    ray_weight: 0.16,
-    outside_weight: 0.3,
-    acceleration: 1.35,
-    angular_acceleration: 5.4,
-    phase_acceleration: 1.35,
-    tilt: 0.08,
-    stature: 0.03,
-    length: 0.025,
-    arm_length: 0.04,
-    width: 0.2,
-    posture: 0.04,
-    deviation: 0.1,
-    turn_acceleration: 40.0,
-};
 const ROUNDS: usize = 3;
 const ITERATIONS: usize = 8;
 

@@ -97,8 +97,8 @@ pub struct Fit {
     pub up: Vector3<f64>,
 }
 
-/// Accelerations of a steady walk's carrier: larger values let noise through, smaller ones cut corners.
-const SETTINGS: Settings = Settings {
+/// The last stages of a fit. Accelerations are those of a steady walk: larger values let noise through, smaller ones cut corners.
+pub const SETTINGS: Settings = Settings {
     model_m: 0.02,
     point_weight: 0.16,
     ray_weight: 0.16,
