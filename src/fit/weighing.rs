@@ -47,8 +47,8 @@ const CAUCHY: f64 = 2.385;
 const OUTSIDE_CAUCHY: f64 = 6.0;
 /// Skin whose outward normal makes a larger cosine than this with the line of sight is not seen.
 const FACING: f64 = 0.2;
-/// Primitives with less than a thousandth of the nearest one's weight are left out: a twentieth of a millimetre.
-const MARGIN: f32 = 3.5;
+/// As the surface itself leaves primitives out, so that exact points of the skin have no distance.
+const MARGIN: f32 = 5.0;
 /// Primitives that a ray passes nearest to, tried as the start of its closest approach.
 const CANDIDATES: usize = 4;
 /// Outlines lower than this above the floor are those of contact shadows.
