@@ -374,6 +374,10 @@ mod tests {
     use crate::motion_model::markers::choose;
     use rand::{RngExt, SeedableRng};
 
+    fn problem_of<'a>(person: &'a Person<'a>, frames: &'a [Vec<Option<Vector3<f64>>>]) -> Problem<'a> {
+        Problem { person, frames: frames.iter().map(Vec::as_slice).collect(), step_s: 0.1, cauchy: 3.0, shared: true }
+    }
+
     /// A state off its rest in everything, with gaps and an outlier: every derivative of (1) has its part in the gradient,
     /// and where residuals vanish the matrix is that of the differences of gradients.
     #[test]
@@ -388,8 +392,7 @@ mod tests {
         let mut random = |n: usize, size: f64| DVector::from_fn(n, |_, _| size * rng.random_range(-1.0..1.0));
         let (y, z) = (random(3 * person.width(), 0.6), random(shareds, 0.03));
         let empty: Vec<Vec<Option<Vector3<f64>>>> = vec![vec![None; matches.len()]; 3];
-        let problem_of = |frames| Problem { person: &person, frames, step_s: 0.1, cauchy: 3.0, shared: true };
-        state = (&problem_of(empty.iter().map(|f| f.as_slice()).collect())).retract(&state, &y, &z);
+        state = (&problem_of(&person, &empty)).retract(&state, &y, &z);
         let placed: Vec<Placement> = state.poses.iter().map(|p| place(&state.shape.offsets(), p)).collect();
         let noise = random(9 * matches.len(), 0.02);
         for (size, what) in [(1.0, "gradient"), (0.0, "matrix")] {
@@ -399,7 +402,7 @@ mod tests {
                 ((f + i) % 7 != 0).then(|| person.position(&state, &placed[f], i) + (noise + outlier) * size)
             };
             let frames: Vec<Vec<Option<Vector3<f64>>>> = (0..3).map(|f| (0..matches.len()).map(|i| seen(f, i)).collect()).collect();
-            let problem = problem_of(frames.iter().map(|f| f.as_slice()).collect());
+            let problem = problem_of(&person, &frames);
             let normal = (&problem).linearise(&state);
             let locals = normal.local_gradient.len();
             let moved = |k: usize, h: f64| {
