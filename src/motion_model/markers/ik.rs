@@ -38,6 +38,8 @@ const LET_GO_M: f64 = 0.1;
 pub enum IkError {
     #[error("no frame shows the set's markers at different heights")]
     Empty,
+    #[error("one frame is no motion; two with the pelvis in sight are the least")]
+    OneFrame,
     #[error("the body does not stand along an axis of the file; the first frames of a recording must show a standing person")]
     Lying,
     #[error("the markers span a person of {size:.3} units, which is no human size in m, cm or mm; correct the file's unit of length")]
@@ -66,6 +68,9 @@ pub struct Solved {
 
 /// Finds body size, marker offsets and poses; `matches` as [`choose`](super::choose) gives them.
 pub fn solve(markers: &Markers, set: &MarkerSet, matches: &[Match]) -> Result<Solved, IkError> {
+    if markers.frames.len() < 2 {
+        return Err(IkError::OneFrame);
+    }
     let upright = start::upright(markers, set, matches)?;
     let person = Person::new(set, matches, upright.stature_m);
     let nominal = person.rest(0).offsets;
