@@ -92,7 +92,7 @@ fn runners_agree_with_their_own_inverse_kinematics() {
     println!("{HEAD}");
     for (subject, speed) in [("subject01", 3), ("subject01", 5), ("subject03", 2), ("subject03", 4)] {
         let (mut markers, _) = read(&data.join(subject).join(format!("expData/Run_{speed}.trc"))).unwrap();
-        markers.frames.truncate(150);
+        markers.frames.truncate(100);
         let solved = solved(&markers);
         let mot = data.join(subject).join(format!("ik/Run_{speed}.mot"));
         let first_s = column(&mot, "hip_flexion_r")[0].0 + solved.first_frame as f64 / markers.fps;
@@ -104,7 +104,7 @@ fn runners_agree_with_their_own_inverse_kinematics() {
 fn walkers_agree_with_their_own_inverse_kinematics() {
     let Some(data) = shared("schreiber-walking") else { return };
     println!("{HEAD}");
-    for trial in ["2014001_C4_05", "2014007_C5_04", "2014015_C4_04", "2014022_C5_02", "2014029_C4_05", "2014050_C5_05", "2015026_C5_03"] {
+    for trial in ["2014007_C5_04", "2014015_C4_04", "2014022_C5_02", "2015026_C5_03"] {
         let (subject, name) = trial.split_at(7);
         let (markers, _) = read(&data.join(subject).join(format!("dynamic/{trial}.c3d"))).unwrap();
         let solved = solved(&markers);
@@ -156,7 +156,8 @@ fn recorded(clip: &Clip, set: &MarkerSet) -> Markers {
 fn worst_sagittal_deg(a: &Clip, b: &Clip) -> f64 {
     use Joint::*;
     let rms = |joint: Joint| {
-        let off: Vec<f64> = a.poses.iter().zip(&b.poses).map(|(a, b)| sagittal_deg(a.joint(joint)) - sagittal_deg(b.joint(joint))).collect();
+        let off: Vec<f64> =
+            a.poses.iter().zip(&b.poses).map(|(a, b)| sagittal_deg(a.joint(joint)) - sagittal_deg(b.joint(joint))).collect();
         let mean = off.iter().sum::<f64>() / off.len() as f64;
         (off.iter().map(|o| (o - mean).powi(2)).sum::<f64>() / off.len() as f64).sqrt()
     };

@@ -29,8 +29,9 @@ const WIDE: f64 = 20.0;
 const NARROW: f64 = 3.0;
 /// A longer time without a pelvis ends the part to use, seconds.
 const LONGEST_GAP_S: f64 = 0.25;
-/// Share of markers let go beyond which the names or the set are wrong.
-const NO_BODY: f64 = 0.15;
+/// Share of markers let go, or found to ride farther than [`LET_GO_M`] and three spreads from where the set says, beyond which
+/// the names or the set are wrong.
+const NO_BODY: f64 = 0.1;
 /// A marker farther from its place is counted as let go, metres.
 const LET_GO_M: f64 = 0.1;
 
@@ -44,9 +45,13 @@ pub enum IkError {
     Lying,
     #[error("the markers span a person of {size:.3} units, which is no human size in m, cm or mm; correct the file's unit of length")]
     Size { size: f64 },
-    #[error("no stretch of frames shows three markers of the pelvis where {set} puts them; correct the names or describe your set in markers.toml")]
+    #[error(
+        "no stretch of frames shows three markers of the pelvis where {set} puts them; correct the names or describe your set in markers.toml"
+    )]
     NoPelvis { set: String },
-    #[error("{percent:.0} % of the markers are farther than {LET_GO_M} m from a body that fits the others: left and right or other names are exchanged, or {set} is not the set used")]
+    #[error(
+        "{percent:.0} % of the markers are farther than {LET_GO_M} m from where they belong on a body that fits the others: left and right or other names are exchanged, or {set} is not the set used"
+    )]
     NoBody { percent: f64, set: String },
 }
 
@@ -82,8 +87,9 @@ pub fn solve(markers: &Markers, set: &MarkerSet, matches: &[Match]) -> Result<So
     let learnt = learn(&person, frames, roots, 1.0 / markers.fps);
     let state = all_frames(&person, frames, &learnt, 1.0 / markers.fps);
     let (rms_m, let_go) = misfit(&person, frames, &state);
-    if let_go > NO_BODY {
-        return Err(IkError::NoBody { percent: 100.0 * let_go, set: set.name.clone() });
+    let wrong = let_go.max(astray(&nominal, &state.offsets, set, matches));
+    if wrong > NO_BODY {
+        return Err(IkError::NoBody { percent: 100.0 * wrong, set: set.name.clone() });
     }
     let mut notices = upright.notices;
     if frames.len() < markers.frames.len() {
@@ -158,6 +164,12 @@ fn misfit(person: &Person, frames: &Frames, state: &State) -> (f64, f64) {
     let held: Vec<f64> = distances.iter().copied().filter(|d| *d <= LET_GO_M).collect();
     let rms_m = (held.iter().map(|d| d * d).sum::<f64>() / held.len().max(1) as f64).sqrt();
     (rms_m, 1.0 - held.len() as f64 / distances.len().max(1) as f64)
+}
+
+/// Share of the markers that ride where the set does not expect them.
+fn astray(nominal: &[Vector3<f64>], found: &[Vector3<f64>], set: &MarkerSet, matches: &[Match]) -> f64 {
+    let is_astray = |i: &usize| (found[*i] - nominal[*i]).norm() > LET_GO_M.max(3.0 * set.markers[matches[*i].marker].spread_m);
+    (0..matches.len()).filter(is_astray).count() as f64 / matches.len().max(1) as f64
 }
 
 /// The same placement of all nodes but the elbows, with the twist about the forearm at the wrist.
