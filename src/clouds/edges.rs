@@ -9,12 +9,12 @@
 //! worse: a weighted median over pixels of like grey, which a shirt's folds mislead. Checked against a drawn step with a
 //! textured near side.
 
-use super::subpixel::{Other, around};
+use super::subpixel::{Other, around, extremes};
 use crate::rig::rectify::Plane;
 use rayon::prelude::*;
 
 /// Width of the strips that are looked for, px: the reach of the correlation windows.
-const REACH_PX: isize = 6;
+const REACH_PX: usize = 6;
 /// Smaller steps are slants, px.
 const JUMP_PX: f32 = 1.0;
 /// T and π of (1), grey levels.
@@ -28,9 +28,11 @@ const CLEARLY: f32 = 0.7;
 pub fn behind(reference: &Plane, others: &[Other], disparity: &Plane) -> Plane {
     let width = disparity.width() as usize;
     let values = disparity.as_raw();
+    let farthest = extremes(values, width, REACH_PX, f32::min);
     let one = |i: usize| {
         let near = values[i];
-        let Some(far) = far_side(values, width, i) else { return near };
+        let beside = farthest[i] < near - JUMP_PX;
+        let Some(far) = beside.then(|| far_side(values, width, i)).flatten() else { return near };
         let [there, here] = [far, near].map(|d| cost(reference, others, i, d));
         match there < CLEARLY * here {
             true => far,
@@ -45,7 +47,7 @@ pub fn behind(reference: &Plane, others: &[Other], disparity: &Plane) -> Plane {
 /// Disparity of the nearest pixel on a farther surface.
 fn far_side(disparity: &[f32], width: usize, i: usize) -> Option<f32> {
     let below = disparity[i] - JUMP_PX;
-    let farther = around(i, REACH_PX, width, disparity.len()).filter(|(_, _, j)| disparity[*j] < below);
+    let farther = around(i, REACH_PX as isize, width, disparity.len()).filter(|(_, _, j)| disparity[*j] < below);
     farther.min_by_key(|(dx, dy, _)| dx * dx + dy * dy).map(|(_, _, j)| disparity[j])
 }
 

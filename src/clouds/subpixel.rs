@@ -133,7 +133,8 @@ pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed:
             }
         }
     }
-    let sigma = per_pixel(&now, |i| match fits[i].map(|fit| sigma_px(&fit, jump_px(&now, width as usize, i))) {
+    let nearest = extremes(&now, width as usize, JUMP_REACH_PX, f32::max);
+    let sigma = per_pixel(&now, |i| match fits[i].map(|fit| sigma_px(&fit, (nearest[i] - now[i]).min(3.0))) {
         Some(sigma) if sigma <= LARGEST_SIGMA_PX => sigma,
         _ => f32::NAN,
     });
@@ -157,16 +158,19 @@ pub(super) fn around(i: usize, radius: isize, width: usize, count: usize) -> imp
 /// D of (2) at pixel `i`: least squares over the neighbours on its surface, with a little weight on no slope where they are few.
 fn plane_at(disparity: &[f32], width: usize, i: usize) -> f32 {
     let here = disparity[i];
-    let (mut normal, mut right) = (Matrix3::from_diagonal(&Vector3::new(0.0, 0.5, 0.5)), Vector3::zeros());
+    // Sums of 1, x, y, x², xy, y², and of d, d x, d y.
+    let (mut normal, mut right) = ([0.0, 0.0, 0.0, 0.5, 0.0, 0.5], [0.0; 3]);
     for (dx, dy, j) in around(i, PLANE_PX, width, disparity.len()) {
         let d = disparity[j] - here;
         if d.abs() <= SAME_SURFACE_PX {
-            let row = Vector3::new(1.0, dx as f32, dy as f32);
-            normal += row * row.transpose();
-            right += row * d;
+            let (x, y) = (dx as f32, dy as f32);
+            normal.iter_mut().zip([1.0, x, y, x * x, x * y, y * y]).for_each(|(sum, v)| *sum += v);
+            right.iter_mut().zip([d, d * x, d * y]).for_each(|(sum, v)| *sum += v);
         }
     }
-    here + normal.cholesky().map_or(0.0, |c| c.solve(&right)[0])
+    let [n, x, y, xx, xy, yy] = normal;
+    let normal = Matrix3::new(n, x, y, x, xx, xy, y, xy, yy);
+    here + normal.cholesky().map_or(0.0, |c| c.solve(&Vector3::from(right))[0])
 }
 
 /// The other view where it sees the surface; NaN where it does not confirm it.
@@ -242,10 +246,21 @@ fn sigma_px(fit: &Fit, jump_px: f32) -> f32 {
     (NOISE_SHARE * noise + MISFIT_SHARE * misfit + JUMP_SHARE * jump_px * jump_px).sqrt()
 }
 
-/// j of (3).
-fn jump_px(disparity: &[f32], width: usize, i: usize) -> f32 {
-    let nearest = around(i, JUMP_REACH_PX as isize, width, disparity.len()).map(|(_, _, j)| disparity[j]).fold(disparity[i], f32::max);
-    (nearest - disparity[i]).min(3.0)
+/// The most extreme known value around every pixel, up to `reach` rows and columns away; `pick` is the minimum or the maximum.
+pub(super) fn extremes(values: &[f32], width: usize, reach: usize, pick: impl Fn(f32, f32) -> f32) -> Vec<f32> {
+    let height = values.len() / width.max(1);
+    let mut padded = vec![f32::NAN; width + 2 * reach];
+    let mut across = vec![f32::NAN; values.len()];
+    for (out, row) in across.chunks_exact_mut(width.max(1)).zip(values.chunks_exact(width.max(1))) {
+        padded[reach..][..width].copy_from_slice(row);
+        (0..=2 * reach).for_each(|k| out.iter_mut().zip(&padded[k..]).for_each(|(o, v)| *o = pick(*o, *v)));
+    }
+    let mut all = vec![f32::NAN; values.len()];
+    for (y, out) in all.chunks_exact_mut(width.max(1)).enumerate() {
+        let rows = y.saturating_sub(reach)..(y + reach + 1).min(height);
+        rows.for_each(|y| out.iter_mut().zip(&across[y * width..]).for_each(|(o, v)| *o = pick(*o, *v)));
+    }
+    all
 }
 
 /// Catmull-Rom interpolation; NaN at the border and beside unknown pixels.
