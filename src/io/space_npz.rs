@@ -14,7 +14,7 @@
 
 use std::path::{Path, PathBuf};
 
-use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion};
+use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::npz::{self, Array, Fault};
@@ -22,7 +22,7 @@ use super::write_atomic;
 use crate::body::BALL_JOINTS;
 use crate::math::pca::Pca;
 use crate::motion_model::Activity;
-use crate::style::space::{Attribute, CURVES, Layout, Member, Space, Vectors};
+use crate::style::space::{Attribute, Layout, Member, Space, Vectors};
 
 const FORMAT: &str = "muybridge-space";
 const VERSION: u32 = 1;
@@ -161,7 +161,8 @@ fn space_of(file: std::fs::File) -> Result<Space, Fault> {
         vectors: Vectors { shape: row(&shapes, i, layout.shape_len()), timing: row(&timings, i, layout.timing_len()) },
     };
     let label = |k: usize| (labelled[k] == 1.0).then_some(labels[k]);
-    let attribute = |(a, name): (usize, &String)| Attribute { name: name.clone(), labels: (0..count).map(|m| label(m * names + a)).collect() };
+    let attribute =
+        |(a, name): (usize, &String)| Attribute { name: name.clone(), labels: (0..count).map(|m| label(m * names + a)).collect() };
     let space = Space {
         layout,
         activity: header.activity,
@@ -186,4 +187,62 @@ fn pca(npz: &mut npz::Reader<std::fs::File>, [mean, basis, eigenvalues]: [&'stat
         return Err(Fault::Damaged("its principal components do not fit its vectors".into()));
     }
     Ok(Pca { mean: DVector::from_vec(mean), basis: DMatrix::from_vec(length, components, basis), eigenvalues })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::motion_model::synthetic;
+    use crate::style::space::{Example, Options};
+
+    fn space() -> Space {
+        let example = |seed: u64| Example::of_cycle(&format!("w{seed}"), &synthetic::subject(Activity::Walking, seed).cycle(1.2, 0));
+        let options = Options { activity: Some(Activity::Walking), intervals: Some(40), ..Options::default() };
+        let mut space = Space::build(&[1, 2, 3].map(example), &options).unwrap();
+        space.set_attribute(Attribute { name: "mood".into(), labels: vec![Some(0.0), None, Some(2.5)] });
+        space
+    }
+
+    #[test]
+    fn comes_back_bit_for_bit() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("s.npz");
+        let space = space();
+        write_space(&path, &space).unwrap();
+        let read = read_space(&path).unwrap();
+        assert_eq!((read.layout, read.activity, read.reference), (space.layout, space.activity, space.reference));
+        assert_eq!((&read.attributes, read.mean_rotations), (&space.attributes, space.mean_rotations));
+        assert!(read.members.iter().zip(&space.members).all(|(a, b)| a.vectors == b.vectors && a.name == b.name));
+        assert_eq!((&read.shape.basis, &read.timing.eigenvalues), (&space.shape.basis, &space.timing.eigenvalues));
+        let bytes = std::fs::read(&path).unwrap();
+        write_space(&path, &read).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), bytes);
+    }
+
+    #[test]
+    fn damaged_and_foreign_files_are_named_as_such() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("x.npz");
+        let space = space();
+        let altered = |change: &dyn Fn(&mut Header, &mut Vec<Array>)| {
+            let (mut header, mut arrays) = (Header::of(&space), arrays(&space));
+            header.blake3 = npz::hash(&header, &arrays);
+            change(&mut header, &mut arrays);
+            npz::archive(&header, arrays).unwrap()
+        };
+        let cases: [(&str, Vec<u8>); 7] = [
+            ("no space of motions (not an .npz archive", b"hello".to_vec()),
+            ("its header names another format", altered(&|h, _| h.format = "muybridge-model".into())),
+            ("version 3", altered(&|h, _| h.version = 3)),
+            ("another skeleton", altered(&|h, _| h.joints.swap(0, 1))),
+            ("0 intervals", altered(&|h, _| h.intervals = 0)),
+            ("array `shapes`: shape", altered(&|h, _| h.intervals = 41)),
+            ("does not match its hash", altered(&|_, a| a[1].values[7] += 1e-9)),
+        ];
+        for (part, bytes) in cases {
+            std::fs::write(&path, bytes).unwrap();
+            let message = read_space(&path).unwrap_err().to_string();
+            assert!(message.contains(part) && message.contains("x.npz") && !message.contains('\n'), "{part}: {message}");
+        }
+    }
 }

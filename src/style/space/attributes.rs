@@ -93,8 +93,7 @@ struct Standard {
 impl Standard {
     fn new(space: &Space, attributes: &[usize]) -> Result<Standard, SpaceError> {
         let label = |attribute: usize, member: usize| space.attributes[attribute].labels[member];
-        let members: Vec<usize> =
-            (0..space.members.len()).filter(|&m| attributes.iter().all(|&a| label(a, m).is_some())).collect();
+        let members: Vec<usize> = (0..space.members.len()).filter(|&m| attributes.iter().all(|&a| label(a, m).is_some())).collect();
         let names = || attributes.iter().map(|&a| space.attributes[a].name.as_str()).collect::<Vec<_>>().join(", ");
         if members.len() < attributes.len() + 2 {
             return Err(SpaceError::Unlabelled { names: names(), found: members.len(), wanted: attributes.len() + 2 });
@@ -152,10 +151,14 @@ impl Network {
         let standard = Standard::new(space, attributes)?;
         let names = || SpaceError::Collinear(attributes.iter().map(|&a| space.attributes[a].name.as_str()).collect::<Vec<_>>().join(", "));
         let weights = weights_of_joint(space, attributes)?;
-        let slopes: Vec<Vectors> = weights.iter().zip(&standard.deviations).map(|(w, d)| {
-            let per_deviation: Vec<f64> = w.iter().map(|w| w * d).collect();
-            combine(space, &per_deviation)
-        }).collect();
+        let slopes: Vec<Vectors> = weights
+            .iter()
+            .zip(&standard.deviations)
+            .map(|(w, d)| {
+                let per_deviation: Vec<f64> = w.iter().map(|w| w * d).collect();
+                combine(space, &per_deviation)
+            })
+            .collect();
         // The line goes through the mean of the members that have these labels.
         let share = 1.0 / standard.members.len() as f64;
         let mean = Vectors::sum(&space.mean(), standard.members.iter().map(|&m| (share, &space.members[m].vectors)));

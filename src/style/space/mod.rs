@@ -61,7 +61,7 @@ pub enum SpaceError {
     Weights(f64),
     #[error("attribute `{name}` is the same for all {labelled} motions that have it, so nothing shows what it means")]
     Constant { name: String, labelled: usize },
-    #[error("the attributes {0} rise and fall together, so they cannot be told apart; ask for one of them, or use the method `slope`")]
+    #[error("the attributes {0} rise and fall together, so they cannot be told apart; leave some out (--keep), or take the method `slope`")]
     Collinear(String),
     #[error("the attributes {names} stand together on {found} motions; a map from them needs at least {wanted}")]
     Unlabelled { names: String, found: usize, wanted: usize },
@@ -237,7 +237,11 @@ fn no_motion<'a>(wanted: &str, names: impl Iterator<Item = &'a String>) -> Space
 fn parts(weights: &[(usize, f64)]) -> Result<Vec<(usize, f64)>, SpaceError> {
     let sum: f64 = weights.iter().map(|w| w.1).sum();
     let size: f64 = weights.iter().map(|w| w.1.abs()).sum();
-    if sum.is_finite() && sum.abs() > 1e-3 * size { Ok(weights.iter().map(|&(i, w)| (i, w / sum)).collect()) } else { Err(SpaceError::Weights(sum)) }
+    if sum.is_finite() && sum.abs() > 1e-3 * size {
+        Ok(weights.iter().map(|&(i, w)| (i, w / sum)).collect())
+    } else {
+        Err(SpaceError::Weights(sum))
+    }
 }
 
 fn check(examples: &[Example]) -> Result<(), SpaceError> {

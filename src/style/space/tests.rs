@@ -143,8 +143,7 @@ fn eigenmotions_are_standard_deviations_of_the_examples() {
     assert_eq!(changed.timing, space.timing.mean);
     // The variance of the members along the direction, by hand.
     let direction = (&changed.shape - &space.shape.mean) / 3.0;
-    let along: Vec<f64> =
-        space.members.iter().map(|m| (&m.vectors.shape - &space.shape.mean).dot(&direction) / direction.norm()).collect();
+    let along: Vec<f64> = space.members.iter().map(|m| (&m.vectors.shape - &space.shape.mean).dot(&direction) / direction.norm()).collect();
     let variance = along.iter().map(|a| a * a).sum::<f64>() / along.len() as f64;
     assert!((variance.sqrt() / direction.norm() - 1.0).abs() < 1e-9);
     assert!(eigenmotion(&space, Some(99), None, 1.0).is_none());
@@ -232,7 +231,10 @@ fn the_network_goes_through_what_is_linear_and_bends_for_the_rest() {
     // A bend at the middle example: the network follows it there, not a far one; a line would spread it over all.
     let mut bent = space.clone();
     bent.members[3].vectors.shape[100] += 1.0;
-    let bent = Space { attributes: space.attributes.clone(), ..Space::of_members(bent.layout, None, bent.mean_rotations, 0, bent.members).unwrap() };
+    let bent = Space {
+        attributes: space.attributes.clone(),
+        ..Space::of_members(bent.layout, None, bent.mean_rotations, 0, bent.members).unwrap()
+    };
     let network = Network::new(&bent, &[0]).unwrap();
     let at = |mu: f64| network.at(&[mu]).shape[100] - Network::new(&space, &[0]).unwrap().at(&[mu]).shape[100];
     assert!(at(4.0) > 0.3 && at(4.0) < 1.0 && at(4.0) > 2.0 * at(2.0), "{} {}", at(4.0), at(2.0));
@@ -243,7 +245,8 @@ fn the_network_goes_through_what_is_linear_and_bends_for_the_rest() {
 fn labels_that_show_nothing_are_refused() {
     let (mut space, ..) = labelled();
     space.set_attribute(Attribute { name: "same".into(), labels: vec![Some(2.0); 7] });
-    space.set_attribute(Attribute { name: "twice".into(), labels: space.attributes[0].labels.iter().map(|l| l.map(|l| 2.0 * l)).collect() });
+    space
+        .set_attribute(Attribute { name: "twice".into(), labels: space.attributes[0].labels.iter().map(|l| l.map(|l| 2.0 * l)).collect() });
     let mut few = vec![None; 7];
     (few[0], few[4]) = (Some(1.0), Some(3.0));
     space.set_attribute(Attribute { name: "few".into(), labels: few });

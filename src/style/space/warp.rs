@@ -214,7 +214,8 @@ mod tests {
         let times = reference.times();
         // The other motion does at w(t) what the reference does at t.
         let w = |t: f64| t + 0.06 * (TAU * t).sin() / TAU * 2.0 + 0.02 * (2.0 * TAU * t + 1.0).sin() - 0.02 * 1.0f64.sin();
-        let inverse = |s: f64| (0..60).fold((0.0, 1.0), |(a, b), _| if w((a + b) / 2.0) < s { ((a + b) / 2.0, b) } else { (a, (a + b) / 2.0) }).0;
+        let inverse =
+            |s: f64| (0..60).fold((0.0, 1.0), |(a, b), _| if w((a + b) / 2.0) < s { ((a + b) / 2.0, b) } else { (a, (a + b) / 2.0) }).0;
         let columns: Vec<_> = (0..100).map(|k| reference.at(&times, inverse(k as f64 / 100.0))).collect();
         let other = Curves { values: DMatrix::from_columns(&columns), ..reference.clone() };
         let found = warp(&reference, &other, 100, false).remove(0);
