@@ -17,7 +17,7 @@ use super::model::default_variance;
 use super::motions::read_recordings;
 
 /// Fractions of stature at which the hip joints stand.
-const HIP_OF_STATURE: f64 = 0.53;
+pub const HIP_OF_STATURE: f64 = 0.53;
 
 #[derive(Args)]
 pub struct GenerateArgs {

@@ -211,6 +211,15 @@ pub fn skeleton(canvas: &mut Canvas, nodes: &[Option<[f64; 2]>; NODES], pen: &Pe
     head(canvas, nodes, pen)
 }
 
+/// Which colour is which side, at the top of a picture of figures, from column `x` on.
+pub fn legend(canvas: &mut Canvas, x: f64) -> Result<(), ReportError> {
+    for (x, name, colour) in [(x, "left", LEFT), (x + 110.0, "right", RIGHT)] {
+        canvas.line([x, 22.0], [x + 28.0, 22.0], colour, 4)?;
+        canvas.text([x + 36.0, 27.0], name, 10.0, INK, Align::Left)?;
+    }
+    Ok(())
+}
+
 /// A circle where the head is: the skull base is its lower back, a neck's length above the base of the neck.
 fn head(canvas: &mut Canvas, nodes: &[Option<[f64; 2]>; NODES], pen: &Pen) -> Result<(), ReportError> {
     let (Some(neck), Some(skull), Some(root)) = (nodes[Joint::Vt1 as usize], nodes[Joint::Skullbase as usize], nodes[0]) else {

@@ -6,7 +6,7 @@ use image::RgbImage;
 use nalgebra::Vector3;
 
 use super::ReportError;
-use super::canvas::{Align, Canvas, GRID, INK, LEFT, Pen, RIGHT, WHITE, skeleton, tick_label, ticks};
+use super::canvas::{Align, Canvas, GRID, INK, Pen, WHITE, legend, skeleton, tick_label, ticks};
 use crate::body::{Clip, NODES, place};
 
 const PX_PER_M: f64 = 200.0;
@@ -20,21 +20,11 @@ pub fn stick_figures(clips: &[(String, &Clip)], figures: usize) -> Result<RgbIma
     let tall = rows.iter().map(|r| r.top_m).fold(1.0, f64::max);
     let row_px = (tall * PX_PER_M) as u32 + 62;
     let mut canvas = Canvas::new(LABEL_PX + (reach * PX_PER_M) as u32 + 30, row_px * rows.len() as u32 + 44, WHITE);
-    legend(&mut canvas)?;
+    legend(&mut canvas, f64::from(LABEL_PX))?;
     for (i, row) in rows.iter().enumerate() {
         row.draw(&mut canvas, f64::from(44 + (i as u32 + 1) * row_px) - 34.0, reach)?;
     }
     Ok(canvas.picture)
-}
-
-fn legend(canvas: &mut Canvas) -> Result<(), ReportError> {
-    let mut x = f64::from(LABEL_PX);
-    for (name, colour) in [("left", LEFT), ("right", RIGHT)] {
-        canvas.line([x, 22.0], [x + 28.0, 22.0], colour, 4)?;
-        canvas.text([x + 36.0, 27.0], name, 10.0, INK, Align::Left)?;
-        x += 110.0;
-    }
-    Ok(())
 }
 
 /// Node positions as (forward, height) in metres from the clip's first root position.

@@ -21,6 +21,7 @@ pub mod figures;
 pub mod maps;
 pub mod overlay;
 pub mod rig;
+pub mod strips;
 
 pub use calibration::calibration;
 pub use clouds::{CloudDot, cloud_and_body};
