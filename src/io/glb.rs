@@ -258,6 +258,9 @@ const U8: u32 = 5121;
 const U16: u32 = 5123;
 const U32: u32 = 5125;
 const F32: u32 = 5126;
+/// What buffer views of vertices and of triangles are for.
+const ARRAY_BUFFER: u32 = 34962;
+const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 
 impl Binary {
     /// Adds an accessor over `bytes` and returns its index.
@@ -345,7 +348,8 @@ fn mesh(skin: &Skin, binary: &mut Binary) -> Value {
     let carrying = |v: &Vertex| -> [u16; 4] { std::array::from_fn(|k| if v.weights[k] > 0.0 { v.bones[k] } else { 0 }) };
     let bones = v.iter().flat_map(carrying).flat_map(u16::to_le_bytes).collect();
     let corners = skin.triangles.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
-    json!({
+    let first = binary.views.len();
+    let primitive = json!({
         "attributes": {
             "POSITION": binary.floats(&positions, "VEC3", true),
             "NORMAL": binary.floats(&normals, "VEC3", false),
@@ -355,7 +359,12 @@ fn mesh(skin: &Skin, binary: &mut Binary) -> Value {
         },
         "indices": binary.push(corners, U32, "SCALAR", 3 * skin.triangles.len(), json!({})),
         "material": 0,
-    })
+    });
+    let count = binary.views.len();
+    for (k, view) in binary.views.iter_mut().enumerate().skip(first) {
+        view["target"] = json!(if k + 1 == count { ELEMENT_ARRAY_BUFFER } else { ARRAY_BUFFER });
+    }
+    primitive
 }
 
 /// Means of the triangles' normals at their corners, by area; viewers shade faces flat without them.

@@ -174,7 +174,7 @@ mod tests {
         let [walk, run] = [(Activity::Walking, 1.4), (Activity::Running, 3.5)].map(|(a, v)| clip(a, v, &shape));
         let standing = Clip { poses: vec![stance(&shape.offsets())], ..walk.clone() };
         for (name, clip, most_mean_m, most_m) in
-            [("rest", &standing, 0.004, 0.01), ("walk", &walk, 0.006, 0.02), ("run", &run, 0.008, 0.025)]
+            [("rest", &standing, 0.004, 0.01), ("walk", &walk, 0.006, 0.02), ("run", &run, 0.01, 0.035)]
         {
             let creature = written(&shape, &[(name, clip)]);
             let all: Vec<_> = (0..clip.poses.len()).step_by(6).map(|k| off_the_surface(&creature, &shape, clip, k)).collect();

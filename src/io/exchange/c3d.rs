@@ -86,7 +86,7 @@ fn parameters(clip: &Clip, data_block: u16) -> Vec<u8> {
                 ("DESCRIPTIONS", Texts(&labels)),
             ],
         ),
-        ("ANALOG", &[("USED", Word(0)), ("GEN_SCALE", Float(1.0)), ("RATE", Float(clip.fps as f32))]),
+        ("ANALOG", &[("USED", Word(0)), ("GEN_SCALE", Float(1.0)), ("RATE", Float(0.0))]),
         ("FORCE_PLATFORM", &[("USED", Word(0))]),
         ("TRIAL", &[("ACTUAL_START_FIELD", Words(&[1, 0])), ("ACTUAL_END_FIELD", Words(&end)), ("CAMERA_RATE", Float(clip.fps as f32))]),
         ("MANUFACTURER", &[("SOFTWARE", Text("muybridge")), ("VERSION_LABEL", Text(env!("CARGO_PKG_VERSION")))]),
