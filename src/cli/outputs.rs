@@ -66,12 +66,20 @@ pub struct Writer {
     /// The body without motions.
     person: muybridge::animal::creature::Creature,
     clip_from_rig: Option<Rotation3<f64>>,
+    source: Source,
     outputs: Outputs,
 }
 
 impl Writer {
     pub fn new(folder: &Path, shape: &Shape, clip_from_rig: Option<Rotation3<f64>>, order: Order, source: Source) -> Writer {
-        Writer { folder: folder.into(), order, person: people_glb::person(shape), clip_from_rig, outputs: Outputs::new(source) }
+        Writer {
+            folder: folder.into(),
+            order,
+            person: people_glb::person(shape),
+            clip_from_rig,
+            source,
+            outputs: Outputs::of_folder(folder),
+        }
     }
 
     /// One motion as BVH, GLB, TRC, C3D and MOT; `title` names the animation.
@@ -87,7 +95,7 @@ impl Writer {
         let kinds =
             [(&names.bvh, Kind::Bvh), (&names.glb, Kind::Glb), (&names.trc, Kind::Trc), (&names.c3d, Kind::C3d), (&names.mot, Kind::Mot)];
         for (name, kind) in kinds {
-            self.outputs.files.insert(name.clone(), FileNote::new(kind, clip.fps, self.clip_from_rig.as_ref()));
+            self.outputs.files.insert(name.clone(), FileNote::new(kind, &self.source, clip.fps, self.clip_from_rig.as_ref()));
         }
         Ok(())
     }
@@ -97,7 +105,7 @@ impl Writer {
         let Some(first) = motions.first() else { return Ok(()) };
         self.person.motions = motions.iter().map(|m| people_glb::motion(&m.stem, &m.clip)).collect();
         glb::write(&self.folder.join(name), &self.person)?;
-        self.outputs.files.insert(name.into(), FileNote::new(Kind::Glb, first.clip.fps, self.clip_from_rig.as_ref()));
+        self.outputs.files.insert(name.into(), FileNote::new(Kind::Glb, &self.source, first.clip.fps, self.clip_from_rig.as_ref()));
         Ok(())
     }
 

@@ -9,6 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::is_motion_file;
+use super::outputs_json::Outputs;
 use crate::motion_model::Activity;
 
 const MANIFEST: &str = "subjects.csv";
@@ -72,8 +73,11 @@ fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -
     }
     let mut children: Vec<PathBuf> = fs::read_dir(path).map_err(failed)?.filter_map(|e| Some(e.ok()?.path())).collect();
     children.sort_by(|a, b| natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then(a.cmp(b)));
+    // What this software wrote stands there in several formats: one of them is enough.
+    let written = Outputs::of_folder(path);
+    let is_copy = |child: &Path| child.file_name().is_some_and(|name| written.is_copy(&name.to_string_lossy()));
     for child in children {
-        if child.is_dir() || is_motion_file(&child) {
+        if child.is_dir() || is_motion_file(&child) && !is_copy(&child) {
             search(&child, entries, seen)?;
         }
     }

@@ -11,6 +11,8 @@ use super::exchange::{c3d_from_clip, opensim_from_clip};
 use super::sidecar::rows;
 use super::write_atomic;
 
+const NAME: &str = "outputs.json";
+
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {path}: {cause}")]
 pub struct OutputsError {
@@ -21,7 +23,6 @@ pub struct OutputsError {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Outputs {
     pub software: String,
-    pub source: Source,
     /// By file name.
     pub files: BTreeMap<String, FileNote>,
 }
@@ -38,6 +39,7 @@ pub struct Source {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FileNote {
     pub content: String,
+    pub source: Source,
     pub length_unit: String,
     pub axes: String,
     pub frames_per_second: f64,
@@ -57,7 +59,7 @@ pub enum Kind {
 
 impl FileNote {
     /// Of a clip's file; `clip_from_rig` is the rotation from the rig's world, if any.
-    pub fn new(kind: Kind, fps: f64, clip_from_rig: Option<&Rotation3<f64>>) -> FileNote {
+    pub fn new(kind: Kind, source: &Source, fps: f64, clip_from_rig: Option<&Rotation3<f64>>) -> FileNote {
         const CLIP: &str = "right-handed, y up; at heading 0 the person looks along +z, left is +x; floor at y = 0";
         const OPENSIM: &str = "right-handed, x forward at heading 0, y up, z right; floor at y = 0";
         let (content, length_unit, axes, file_from_clip) = match kind {
@@ -69,6 +71,7 @@ impl FileNote {
         };
         FileNote {
             content: content.into(),
+            source: source.clone(),
             length_unit: length_unit.into(),
             axes: axes.into(),
             frames_per_second: fps,
@@ -78,13 +81,22 @@ impl FileNote {
 }
 
 impl Outputs {
-    pub fn new(source: Source) -> Outputs {
-        Outputs { software: concat!("muybridge ", env!("CARGO_PKG_VERSION")).into(), source, files: BTreeMap::new() }
+    /// Of a folder: what its `outputs.json` says, if this software wrote one, of files that are still there.
+    pub fn of_folder(folder: &Path) -> Outputs {
+        let known = std::fs::read_to_string(folder.join(NAME)).ok().and_then(|text| serde_json::from_str::<Outputs>(&text).ok());
+        let mut files = known.map_or_else(BTreeMap::new, |known| known.files);
+        files.retain(|name, _| folder.join(name).is_file());
+        Outputs { software: concat!("muybridge ", env!("CARGO_PKG_VERSION")).into(), files }
+    }
+
+    /// Whether a file of the folder holds a motion that its BVH file holds as well.
+    pub fn is_copy(&self, name: &str) -> bool {
+        self.files.contains_key(name) && !name.ends_with(".bvh")
     }
 
     /// Writes `outputs.json` into a folder.
     pub fn write(&self, folder: &Path) -> Result<(), OutputsError> {
-        let path = folder.join("outputs.json");
+        let path = folder.join(NAME);
         // Plain fields and finite numbers always serialise.
         let text = serde_json::to_string_pretty(self).unwrap_or_default() + "\n";
         write_atomic(&path, text.as_bytes()).map_err(|cause| OutputsError { path, cause })
@@ -101,18 +113,28 @@ mod tests {
         // A rig that stands on z.
         let clip_from_rig = Rotation3::new(Vector3::x() * -std::f64::consts::FRAC_PI_2);
         let up = |kind| {
-            let rows = FileNote::new(kind, 30.0, Some(&clip_from_rig)).file_from_rig_world.unwrap();
+            let rows = FileNote::new(kind, &Source::default(), 30.0, Some(&clip_from_rig)).file_from_rig_world.unwrap();
             rows.map(|row| row[2].round() as i32)
         };
         assert_eq!(
             [Kind::Bvh, Kind::Glb, Kind::Trc, Kind::C3d, Kind::Mot].map(up),
             [[0, 1, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0]]
         );
-        let mut outputs = Outputs::new(Source { motion: "walk_p03".into(), ..Source::default() });
-        outputs.files.insert("a.bvh".into(), FileNote::new(Kind::Bvh, 30.0, None));
+    }
+
+    #[test]
+    fn a_folder_keeps_the_notes_of_its_files() {
         let folder = tempfile::tempdir().unwrap();
+        let mut outputs = Outputs::of_folder(folder.path());
+        let source = Source { motion: "walk_p03".into(), ..Source::default() };
+        for (name, kind) in [("a.bvh", Kind::Bvh), ("a.mot", Kind::Mot)] {
+            outputs.files.insert(name.into(), FileNote::new(kind, &source, 30.0, None));
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
         outputs.write(folder.path()).unwrap();
-        let text = std::fs::read_to_string(folder.path().join("outputs.json")).unwrap();
-        assert_eq!(serde_json::from_str::<Outputs>(&text).unwrap(), outputs);
+        assert_eq!(Outputs::of_folder(folder.path()), outputs);
+        assert!(outputs.is_copy("a.mot") && !outputs.is_copy("a.bvh") && !outputs.is_copy("b.mot"));
+        std::fs::remove_file(folder.path().join("a.mot")).unwrap();
+        assert_eq!(Outputs::of_folder(folder.path()).files.len(), 1);
     }
 }

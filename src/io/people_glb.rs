@@ -16,7 +16,7 @@ use crate::body::{Clip, Joint, Length, Pose, PosedSurface, Shape, Surface, place
 const CELLS: f64 = 125.0;
 
 /// Skull and jaw: centres from the skull base and semi-axes, fractions of stature.
-const HEAD: [([f64; 3], [f64; 3]); 2] = [([0.0, 0.047, -0.006], [0.070, 0.070, 0.086]), ([0.0, 0.004, 0.012], [0.052, 0.066, 0.060])];
+const HEAD: [([f64; 3], [f64; 3]); 2] = [([0.0, 0.047, -0.006], [0.070, 0.070, 0.086]), ([0.0, -0.004, 0.019], [0.050, 0.056, 0.056])];
 
 /// Slices of the trunk, every [`TRUNK_STEP`]: node, height and depth of the centre, half width and half depth of the skin, fractions of
 /// stature; hips 0.19, waist 0.165 and chest 0.18 wide as in [`surface`](crate::body::surface).
