@@ -13,6 +13,7 @@ mod interrupt;
 mod model;
 mod motions;
 mod observe;
+mod outputs;
 mod progress;
 mod render;
 mod rig;
