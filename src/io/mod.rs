@@ -25,6 +25,7 @@ pub mod ply;
 pub mod rig_files;
 pub mod session;
 pub mod sidecar;
+pub mod status_json;
 pub mod style_json;
 pub mod video;
 
