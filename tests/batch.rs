@@ -155,7 +155,8 @@ fn a_study_with_broken_sessions() {
     let first = batch(&study, &results, &[]);
     assert_eq!(first.status.code(), Some(1), "{}", said(&first));
     let told = said(&first);
-    for words in ["7 sessions: 4 done, 3 failed", "000002.png: ends early", "Calib.toml", "option/muybridge.toml: line 1", "error: 3 of 7"] {
+    for words in ["7 sessions: 4 done, 3 failed", "000002.png: ends early", "Calib.toml", "option/muybridge.toml: line 1", "error: 3 of 7"]
+    {
         assert!(told.contains(words), "{words}: {told}");
     }
     let undisturbed = outputs(&results);
@@ -183,7 +184,9 @@ fn a_study_with_broken_sessions() {
     fs::copy(film.join("cam_02/000001.png"), study.join("a/walk_1/cam_02/000000.png")).unwrap();
     fs::write(study.join("a/walk_10/muybridge.toml"), "variance = 0.9\n").unwrap();
     let list = succeed(&["batch", "list", text(&study), "-o", text(&results)]);
-    for line in ["a/walk_1    run      inputs changed", "a/walk_10   run      options changed", "b/cut       run      inputs changed", "3 of 7"] {
+    for line in
+        ["a/walk_1    run      inputs changed", "a/walk_10   run      options changed", "b/cut       run      inputs changed", "3 of 7"]
+    {
         assert!(list.contains(line), "{line}: {list}");
     }
     let edited = said(&batch(&study, &results, &[]));
@@ -216,7 +219,8 @@ fn killed_at_any_moment_and_resumed_gives_the_same_bytes() {
         // What is there at that moment is whole.
         for session in ["one", "two", "three"] {
             let folder = results.join(session);
-            let there = folder.read_dir().map_or(0, |entries| entries.filter(|e| e.as_ref().is_ok_and(|e| e.file_name() != "status.json")).count());
+            let there =
+                folder.read_dir().map_or(0, |entries| entries.filter(|e| e.as_ref().is_ok_and(|e| e.file_name() != "status.json")).count());
             let done = folder.join("status.json").exists() && state(&results, session) == "done";
             assert_eq!(there > 0, done, "{session} after {pause_ms} ms");
         }
@@ -287,7 +291,8 @@ fn a_stopped_track_goes_on_with_the_frames_it_has() {
     let plain = track("plain", &[]);
     let options = ["--work", text(&work)];
     assert!(track("first", &options) == plain);
-    let kept: Vec<PathBuf> = work.read_dir().unwrap().flat_map(|e| e.unwrap().path().read_dir().unwrap()).map(|e| e.unwrap().path()).collect();
+    let kept: Vec<PathBuf> =
+        work.read_dir().unwrap().flat_map(|e| e.unwrap().path().read_dir().unwrap()).map(|e| e.unwrap().path()).collect();
     let frame = |number: usize| kept.iter().find(|p| p.ends_with(format!("{number:06}.frame"))).unwrap();
     assert_eq!(kept.len(), FRAMES);
 
@@ -344,4 +349,40 @@ fn a_slurm_array_gives_the_same_bytes_and_takes_only_what_is_missing() {
     assert!(third.contains("1 of 4 sessions submitted as 1 tasks"), "{third}");
     until("the second array", || results.join("summary.csv").exists());
     assert_eq!(state(&results, "broken"), "done");
+}
+
+#[test]
+fn the_rule_file_for_snakemake_runs_a_study() {
+    let answers = Command::new("snakemake").arg("--version").output().is_ok_and(|o| o.status.success());
+    if !answers {
+        eprintln!("notice: no snakemake here; `pip install snakemake` in a virtual environment on the PATH brings it");
+        return;
+    }
+    let place = tempfile::tempdir().unwrap();
+    let film = film(place.path(), 1);
+    let study = study(place.path(), &film, &["one", "g/it's two"]);
+    let local = place.path().join("local");
+    assert!(batch(&study, &local, &[]).status.success());
+    let results = place.path().join("results");
+    let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/Snakefile");
+    let snakemake = || {
+        let config = [
+            format!("study={}", text(&study)),
+            format!("results={}", text(&results)),
+            format!("muybridge={}", env!("CARGO_BIN_EXE_muybridge")),
+        ];
+        let mut command = Command::new("snakemake");
+        command.args(["-s", text(&rules), "--cores", "2", "--keep-going", "--config"]).args(config).current_dir(place.path());
+        command.output().unwrap()
+    };
+    let first = snakemake();
+    assert!(first.status.success(), "{}", said(&first));
+    assert!(outputs(&results) == outputs(&local));
+    let before = fs::read(results.join("one/status.json")).unwrap();
+
+    // Edited and broken: that one is run again and fails, the other is left as it is.
+    fs::write(study.join("g/it's two/cam_00/000003.png"), "no picture").unwrap();
+    let second = snakemake();
+    assert!(!second.status.success() && said(&second).contains("000003.png"), "{}", said(&second));
+    assert_eq!((state(&results, "g/it's two"), fs::read(results.join("one/status.json")).unwrap()), ("failed".into(), before));
 }

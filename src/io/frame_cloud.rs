@@ -43,7 +43,8 @@ pub fn read(path: &Path) -> Option<FrameCloud> {
     }
     let mut rest = Bytes(body.strip_prefix(MAGIC)?);
     let cloud = take_cloud(&mut rest)?;
-    let masks = (0..rest.u64()?).map(|_| Some(if rest.u8()? == 0 { None } else { Some(take_picture(&mut rest)?) })).collect::<Option<_>>()?;
+    let masks =
+        (0..rest.u64()?).map(|_| Some(if rest.u8()? == 0 { None } else { Some(take_picture(&mut rest)?) })).collect::<Option<_>>()?;
     let (disparity, matched) = (take_plane(&mut rest)?, take_plane(&mut rest)?);
     Some(FrameCloud { cloud, masks, disparity, matched, changed: take_picture(&mut rest)? })
 }
@@ -171,9 +172,7 @@ mod tests {
             confidence: 0.1 + f64::from(i),
             covariance: Matrix3::from_fn(|r, c| 1.0 / f64::from(i + 1 + (3 * r + c) as i32)),
         };
-        let plane = |gap: u32| {
-            Plane::from_fn(7, 5, |x, y| Luma([if (x + y) % 4 < gap { f32::NAN } else { 0.1 * (x * y) as f32 }]))
-        };
+        let plane = |gap: u32| Plane::from_fn(7, 5, |x, y| Luma([if (x + y) % 4 < gap { f32::NAN } else { 0.1 * (x * y) as f32 }]));
         let mask = GrayImage::from_fn(9, 4, |x, y| Luma([if x > 3 && y > 1 { 255 } else { 0 }]));
         FrameCloud {
             cloud: Cloud { points: (0..4).map(point).collect() },

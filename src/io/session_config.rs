@@ -86,10 +86,8 @@ mod tests {
             fs::create_dir(folder).unwrap();
             fs::write(folder.join(FILE), text).unwrap();
         }
-        let relative = |c: SessionConfig| SessionConfig {
-            model: c.model.map(|m| m.strip_prefix(place.path()).unwrap().to_path_buf()),
-            ..c
-        };
+        let relative =
+            |c: SessionConfig| SessionConfig { model: c.model.map(|m| m.strip_prefix(place.path()).unwrap().to_path_buf()), ..c };
         read(&folders[2]).map(relative).map_err(|e| e.to_string())
     }
 

@@ -175,7 +175,8 @@ mod tests {
     use super::*;
 
     fn failed() -> Status {
-        let key = Key { inputs_hash: "a1".into(), options_hash: "b2".into(), model_hash: "embedded walking".into(), version: "0.1.0".into() };
+        let key =
+            Key { inputs_hash: "a1".into(), options_hash: "b2".into(), model_hash: "embedded walking".into(), version: "0.1.0".into() };
         let reason = Some("cam_01/3.png: \"ends\" early, copy it".into());
         Status { state: State::Failed, reason, seconds: Some(1.5), ..Status::pending("g/walk, 3", Path::new("/s/g/walk, 3"), &key) }
     }

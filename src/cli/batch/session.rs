@@ -179,7 +179,8 @@ fn reason(log: &File, exit: ExitStatus, path: &Path) -> String {
     }
     #[cfg(unix)]
     if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&exit) {
-        let remedy = if signal == 9 { "; most often that is the system out of memory: run again with fewer --jobs and --retry-failed" } else { "" };
+        let remedy =
+            if signal == 9 { "; most often that is the system out of memory: run again with fewer --jobs and --retry-failed" } else { "" };
         return format!("the process was killed by signal {signal}{remedy}");
     }
     format!("the process ended with {exit}; {} has what it said", path.display())
@@ -208,7 +209,8 @@ pub fn worker(args: &WorkerArgs) -> Result<()> {
     end_with_the_supervisor();
     track::run(&TrackArgs::of(&args.session, args.work.join("out"), args.work.clone()))?;
     let path = args.work.join(MEMORY_FILE);
-    std::fs::write(&path, peak_memory_mb().map_or(String::new(), |mb| mb.to_string())).with_context(|| format!("cannot write {}", path.display()))
+    std::fs::write(&path, peak_memory_mb().map_or(String::new(), |mb| mb.to_string()))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Nothing is ever written to the worker's input: it ends when the supervisor has ended or wants this process to end.

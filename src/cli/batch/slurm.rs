@@ -62,9 +62,8 @@ pub fn submit(study: &Study, sessions: &[StudySession], ask: &Ask) -> Result<()>
     let folder = study.results.join(".work/slurm");
     std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     let queued = queued(&folder)?;
-    let missing = |s: &&StudySession| {
-        !queued.contains(&s.name) && !study.is_busy(&s.name) && matches!(study.plan(s, &study.key(s)), Plan::Run(_))
-    };
+    let missing =
+        |s: &&StudySession| !queued.contains(&s.name) && !study.is_busy(&s.name) && matches!(study.plan(s, &study.key(s)), Plan::Run(_));
     let wanted: Vec<&StudySession> = sessions.par_iter().filter(missing).collect();
     let waiting = sessions.iter().filter(|s| queued.contains(&s.name)).count();
     if wanted.is_empty() {
@@ -175,11 +174,7 @@ fn array_job(study: &Study, list: &Path, tasks: usize, memory_mb: u32, ask: &Ask
 }
 
 fn summary_job(study: &Study, list: &Path, array: &str) -> Job {
-    let options = [
-        "--job-name=muybridge-summary".to_string(),
-        format!("--dependency=afterany:{array}"),
-        format!("--mem={SUMMARY_MB}M"),
-    ];
+    let options = ["--job-name=muybridge-summary".to_string(), format!("--dependency=afterany:{array}"), format!("--mem={SUMMARY_MB}M")];
     job(list, "summary", options.to_vec(), script(study, "batch summary", ""))
 }
 

@@ -42,13 +42,12 @@ pub enum Plan {
 }
 
 impl Study {
-    /// `results` is `study/results` without a word about it; it is created.
+    /// `results` is `study/results` without a word about it; it need not be there yet.
     pub fn open(study: &Path, results: Option<&Path>, retry: bool) -> Result<Study> {
         ensure!(study.is_dir(), "{}: is not a folder; give the folder that holds the session folders", study.display());
         let folder = study.canonicalize().with_context(|| study.display().to_string())?;
-        let results = results.map_or_else(|| folder.join("results"), Path::to_path_buf);
-        std::fs::create_dir_all(&results).with_context(|| format!("cannot create {}", results.display()))?;
-        let results = results.canonicalize().with_context(|| results.display().to_string())?;
+        let results = results.map_or_else(|| Ok(folder.join("results")), std::path::absolute)?;
+        let results = results.canonicalize().unwrap_or(results);
         let program = content::program(&super::super::executable());
         Ok(Study { folder, results, program, retry })
     }
@@ -60,7 +59,11 @@ impl Study {
         self.search(&self.folder, &mut Vec::new(), &mut found)?;
         let itself = found.iter().any(|s| s.name.is_empty());
         ensure!(!itself, "{}: is a session itself; run `muybridge track` on it, or give the folder above", self.folder.display());
-        ensure!(!found.is_empty(), "{}: no session below it; a session folder holds {RIG_FILE} and the cameras' footage", self.folder.display());
+        ensure!(
+            !found.is_empty(),
+            "{}: no session below it; a session folder holds {RIG_FILE} and the cameras' footage",
+            self.folder.display()
+        );
         let reserved = found.iter().find(|s| s.name.split('/').next().is_some_and(|part| RESERVED.contains(&part)));
         if let Some(session) = reserved {
             anyhow::bail!("{}: a batch writes a file of this name itself; rename the folder", session.folder.display());
