@@ -23,7 +23,9 @@ pub struct BatchArgs {
     #[command(subcommand)]
     command: Option<BatchCommand>,
     #[command(flatten)]
-    run: Option<RunArgs>,
+    place: Option<PlaceArgs>,
+    #[command(flatten)]
+    run: RunArgs,
 }
 
 #[derive(Subcommand)]
@@ -55,8 +57,6 @@ struct PlaceArgs {
 
 #[derive(Args)]
 struct RunArgs {
-    #[command(flatten)]
-    place: PlaceArgs,
     /// Where to work: on this machine, or as a job array of the Slurm that answers here
     #[arg(long, default_value = "local")]
     engine: Engine,
@@ -84,17 +84,19 @@ enum Engine {
 }
 
 pub fn run(args: &BatchArgs, threads: Option<usize>) -> Result<()> {
-    match (&args.command, &args.run) {
-        (Some(BatchCommand::List { place, names }), _) => table::list(&place.open(false)?, *names),
-        (Some(BatchCommand::Status(place)), _) => table::status(&place.open(false)?),
-        (Some(BatchCommand::Summary(place)), _) => {
+    match &args.command {
+        Some(BatchCommand::List { place, names }) => table::list(&place.open(false)?, *names),
+        Some(BatchCommand::Status(place)) => table::status(&place.open(false)?),
+        Some(BatchCommand::Summary(place)) => {
             let study = place.open(false)?;
             let sessions = study.sessions()?;
             table::summarise(&study, &sessions, &sessions)
         }
-        (Some(BatchCommand::Worker(args)), _) => session::worker(args),
-        (None, Some(args)) => batch(args, threads),
-        (None, None) => anyhow::bail!("give the study's folder"),
+        Some(BatchCommand::Worker(args)) => session::worker(args),
+        None => {
+            let place = args.place.as_ref().context("give the study's folder")?;
+            batch(&place.open(args.run.retry_failed)?, &args.run, threads)
+        }
     }
 }
 
@@ -104,16 +106,15 @@ impl PlaceArgs {
     }
 }
 
-fn batch(args: &RunArgs, threads: Option<usize>) -> Result<()> {
-    let study = args.place.open(args.retry_failed)?;
+fn batch(study: &Study, args: &RunArgs, threads: Option<usize>) -> Result<()> {
     let all = study.sessions()?;
     let chosen = choose(&all, args)?;
     if args.engine == Engine::Slurm {
         let ask = slurm::Ask { threads: threads.unwrap_or(1), at_once: args.jobs, memory_mb: args.memory };
-        return slurm::submit(&study, &chosen, &ask);
+        return slurm::submit(study, &chosen, &ask);
     }
     let threads = threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, |n| n.get()));
-    let outcome = local::work(&study, &chosen, args.jobs.map_or(threads, usize::from), threads)?;
+    let outcome = local::work(study, &chosen, args.jobs.map_or(threads, usize::from), threads)?;
     if args.share.is_some() {
         // The summary is the dependent job's.
         return outcome.verdict();
@@ -122,7 +123,7 @@ fn batch(args: &RunArgs, threads: Option<usize>) -> Result<()> {
     if outcome.done + outcome.failed == 0 {
         println!("nothing to do: nothing changed since the last run");
     }
-    table::summarise(&study, &all, &chosen).and(outcome.verdict())
+    table::summarise(study, &all, &chosen).and(outcome.verdict())
 }
 
 /// The sessions that the command line names, all without a name.

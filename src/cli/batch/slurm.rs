@@ -111,18 +111,18 @@ fn queued(folder: &Path) -> Result<BTreeSet<String>> {
 /// A new list of sessions, with a number that no other submission has.
 fn new_list(folder: &Path, sessions: &[&StudySession]) -> Result<PathBuf> {
     let text: String = sessions.iter().map(|s| format!("{}\n", s.name)).collect();
-    for number in 1.. {
+    let mut number = 1;
+    loop {
         let path = folder.join(format!("{number}.list"));
         match std::fs::File::create_new(&path) {
             Ok(_) => {
                 write_atomic(&path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
                 return Ok(path);
             }
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => number += 1,
             Err(error) => return Err(error).with_context(|| format!("cannot write {}", path.display())),
         }
     }
-    unreachable!("numbers do not end")
 }
 
 fn max_array_size() -> Result<usize> {
