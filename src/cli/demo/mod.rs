@@ -106,7 +106,7 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
     let model = clock.time("model", || NamedModel::synthetic(Activity::Walking))?;
     let mut depth = None;
     let seen = clock.time("clouds", || {
-        track::look(&session, |rig, frame, found| {
+        track::look(&session, None, |rig, frame, found| {
             if frame.number.is_multiple_of(CLOUD_EVERY) {
                 write_ply(&folder.join(format!("clouds/{:06}.ply", frame.number)), &found.cloud)?;
             }
@@ -116,7 +116,7 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
             Ok(())
         })
     })?;
-    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default()))?;
+    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default(), None))?;
     let generated = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
     let rows = clock.time("errors and pictures", || {
         let rows = errors::rows(&truth, &model, &tracked, &generated)?;
