@@ -4,13 +4,14 @@ use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use muybridge::body::Shape;
+use muybridge::body::{Clip, Shape};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
 use muybridge::io::style_json::read_style;
 use muybridge::io::{bvh, is_motion_file, write_atomic};
 use muybridge::motion::{Length, Synthesis, play, synthesize};
 use muybridge::motion_model::{Activity, Model};
+use muybridge::report::generated::{GeneratedReport, Made};
 use muybridge::style::{Metric, Population, Style};
 
 use super::model::default_variance;
@@ -69,6 +70,7 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     let wanted = model.components(args.variance.unwrap_or(default_variance(model.activity)));
     let population = Population::new(&model, wanted.min(style.weights.len()));
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
+    let mut made = Vec::new();
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
     for (value, name) in values.iter().zip(&names) {
         let synthesis = synthesize(&model, &population, metric, &style, *value, shape.hip_height_m())?;
@@ -79,9 +81,28 @@ pub fn run(args: GenerateArgs) -> Result<()> {
         bvh::write_clip(&args.output.join(name), &clip, None)?;
         println!("{}: {} frames, {:.3} cycles/s", args.output.join(name).display(), clip.poses.len(), synthesis.frequency_hz);
         let _ = writeln!(table, "{}", table_row(name, &model, &synthesis));
+        made.push((synthesis, clip));
     }
     write_atomic(&args.output.join("generated.csv"), table.as_bytes()).with_context(|| args.output.display().to_string())?;
-    Ok(())
+    report(&args, &model, &style, &names, &made)
+}
+
+/// Writes report.html.
+fn report(args: &GenerateArgs, model: &Model, style: &Style, names: &[String], made: &[(Synthesis, Clip)]) -> Result<()> {
+    let made = names.iter().zip(made).map(|(file, (synthesis, clip))| Made { file, synthesis, clip }).collect();
+    let page = GeneratedReport {
+        model,
+        model_name: &args.model.display().to_string(),
+        style,
+        style_name: &args.style.display().to_string(),
+        made,
+        options: &[
+            ("weighing", if args.mahalanobis { "Mahalanobis" } else { "the paper's" }.to_string()),
+            ("frames per second", args.fps.to_string()),
+        ],
+    };
+    let path = args.output.join("report.html");
+    write_atomic(&path, page.html()?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn table_row(name: &str, model: &Model, s: &Synthesis) -> String {

@@ -16,6 +16,7 @@ mod progress;
 mod render;
 mod rig;
 mod track;
+mod track_report;
 mod whole;
 
 use anyhow::Result;

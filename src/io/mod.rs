@@ -10,6 +10,7 @@ pub mod calib_views;
 pub mod calibration_json;
 pub mod creature_bvh;
 pub mod fit_json;
+pub mod gait_csv;
 pub mod glb;
 pub mod images;
 pub mod joints_csv;
