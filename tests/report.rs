@@ -26,10 +26,8 @@ fn run(arguments: &[&str]) {
 
 /// A small database whose subjects have nasty names.
 fn model(path: &Path) {
-    let cycle = |seed: u64, speed: f64| Cycle {
-        subject: format!("{seed} {NASTY}"),
-        ..synthetic::subject(Activity::Walking, seed).cycle(speed, 0)
-    };
+    let cycle =
+        |seed: u64, speed: f64| Cycle { subject: format!("{seed} {NASTY}"), ..synthetic::subject(Activity::Walking, seed).cycle(speed, 0) };
     let cycles: Vec<Cycle> = (1..=5).flat_map(|seed| [0.9, 1.3, 1.7].map(|speed| cycle(seed, speed))).collect();
     model_npz::write_model(path, &Model::build(Activity::Walking, true, &cycles).unwrap()).unwrap();
 }
@@ -154,7 +152,9 @@ fn turn_about(reader: &Reader, page: &Path) {
     let label = "return document.getElementById('view3d-label').textContent;";
     let (before, first) = (reader.numbers(eye), browser.script(label));
     browser.script("document.getElementById('view3d').scrollIntoView();");
-    let at = reader.numbers("const r = document.getElementById('view3d-plot').getBoundingClientRect(); return [r.left + r.width / 2, r.top + r.height / 2];");
+    let at = reader.numbers(
+        "const r = document.getElementById('view3d-plot').getBoundingClientRect(); return [r.left + r.width / 2, r.top + r.height / 2];",
+    );
     browser.drag(&[[at[0], at[1]], [at[0] + 60.0, at[1] + 10.0], [at[0] + 160.0, at[1] + 30.0]]);
     let turned: f64 = reader.numbers(eye).iter().zip(&before).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
     assert!(turned > 0.2, "{before:?} {:?}", reader.numbers(eye));

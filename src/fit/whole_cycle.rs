@@ -61,10 +61,12 @@ fn angle(fit: &Fit, sample: &CurveSample, foot: usize, j: usize) -> (f64, f64) {
     let of = |v: Vector3<f64>, c: Vector3<f64>| flexion(&(fit.curve.mean_rotations[node] * exp(&v) * exp(&c)), j);
     let Some(uncertainty) = &fit.uncertainty else { return (of(v, c), f64::NAN) };
     const H: f64 = 1e-5;
-    let slope = |d: &dyn Fn(Vector3<f64>) -> f64| Vector3::from_fn(|axis, _| {
-        let step = Vector3::ith(axis, H);
-        (d(step) - d(-step)) / (2.0 * H)
-    });
+    let slope = |d: &dyn Fn(Vector3<f64>) -> f64| {
+        Vector3::from_fn(|axis, _| {
+            let step = Vector3::ith(axis, H);
+            (d(step) - d(-step)) / (2.0 * H)
+        })
+    };
     let by_v = slope(&|step| of(v + step, c));
     let by_c = slope(&|step| of(v, c + step));
     let layout = fit.state.layout();

@@ -146,13 +146,7 @@ fn strides(track: &Track, strikes_s: &[f64], toe_offs_s: &[f64], places: &[Optio
 }
 
 /// Steps of the first foot; strikes and places of it and of the other one.
-fn steps(
-    track: &Track,
-    strikes_s: [&[f64]; 2],
-    places: [&[Option<Vector2<f64>>]; 2],
-    left: bool,
-    stride_s: Option<f64>,
-) -> Vec<Step> {
+fn steps(track: &Track, strikes_s: [&[f64]; 2], places: [&[Option<Vector2<f64>>]; 2], left: bool, stride_s: Option<f64>) -> Vec<Step> {
     let one = |(i, at_s): (usize, &f64)| {
         let before = strikes_s[1].iter().rposition(|t| t < at_s)?;
         let time_s = at_s - strikes_s[1][before];
@@ -230,9 +224,8 @@ pub fn flexion(rotation: &UnitQuaternion<f64>, joint: usize) -> f64 {
 
 /// Hip, knee and ankle of the left (0) or right (1) leg over a stride of the clip, 0 to 100 %, radians.
 pub fn cycle_angles(clip: &Clip, foot: usize, stride: &Stride) -> [[f64; PERCENTS]; 3] {
-    let poses: Vec<Pose> = (0..PERCENTS)
-        .map(|k| pose_at(clip, stride.from_s + (stride.to_s - stride.from_s) * k as f64 / (PERCENTS - 1) as f64))
-        .collect();
+    let poses: Vec<Pose> =
+        (0..PERCENTS).map(|k| pose_at(clip, stride.from_s + (stride.to_s - stride.from_s) * k as f64 / (PERCENTS - 1) as f64)).collect();
     [0, 1, 2].map(|j| std::array::from_fn(|k| flexion(poses[k].joint(LEGS[foot][j]), j)))
 }
 

@@ -30,7 +30,8 @@ impl AnimalReport<'_> {
         let pictures: Vec<Markup> = self.pictures.iter().map(|(caption, png)| picture(&png_file_uri(png), caption)).collect();
         let mut sections = vec![Section::new("Pictures", html! { div.gallery.wide { @for p in &pictures { (p) } } })];
         if let Some(record) = self.analysis {
-            sections.push(Section::new("Rhythm", html! { (gallery(&[coefficients(record), explained(record)])) pre { (self.analysis_text) } }));
+            sections
+                .push(Section::new("Rhythm", html! { (gallery(&[coefficients(record), explained(record)])) pre { (self.analysis_text) } }));
         }
         if !self.keys_text.is_empty() {
             sections.push(Section::new("Key images", html! { pre { (self.keys_text) } }));

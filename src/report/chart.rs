@@ -239,7 +239,8 @@ mod tests {
     fn lines_go_through_their_points_and_break_at_gaps() {
         let points = vec![[0.0, 0.0], [1.0, 1.0], [2.0, f64::NAN], [3.0, 1.0], [4.0, 2.0]];
         let curve = Curve { label: "a & b".into(), points, dashed: false, colour: 1, band: vec![0.5; 5] };
-        let chart = Chart { title: "<t>".into(), curves: vec![curve], x_range: Some([0.0, 4.0]), y_range: Some([0.0, 2.0]), ..Chart::default() };
+        let chart =
+            Chart { title: "<t>".into(), curves: vec![curve], x_range: Some([0.0, 4.0]), y_range: Some([0.0, 2.0]), ..Chart::default() };
         let text = chart.figure().into_string();
         // The drawing is 402 by 206.
         assert!(text.contains("d=\"M0 206L100.5 103M301.5 103L402 0\""), "{text}");

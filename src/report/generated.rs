@@ -10,8 +10,8 @@ use super::style_charts::{against_parameter, clusters};
 use super::{ReportError, stick_figures};
 use crate::body::Clip;
 use crate::motion::Synthesis;
-use crate::motion_model::gait::{Gait, Measure, PERCENTS, cycle_angles, gait};
 use crate::motion_model::Model;
+use crate::motion_model::gait::{Gait, Measure, PERCENTS, cycle_angles, gait};
 use crate::style::Style;
 
 /// Figures of one row of the chronophotograph, over this time.
@@ -46,7 +46,10 @@ impl GeneratedReport<'_> {
     /// The whole page.
     pub fn html(&self) -> Result<String, ReportError> {
         let gaits: Vec<Gait> = self.made.iter().map(|m| gait(m.clip)).collect();
-        let mut sections = vec![Section::new("Motions", html! { (self.table()) (picture(&png_uri(&self.figures()?)?, "The motions from the subject's right, to one scale; early instants pale.")) })];
+        let mut sections = vec![Section::new(
+            "Motions",
+            html! { (self.table()) (picture(&png_uri(&self.figures()?)?, "The motions from the subject's right, to one scale; early instants pale.")) },
+        )];
         if self.model.activity.is_cyclic() {
             sections.push(Section::new("Gait", self.gait(&gaits)));
         }
@@ -78,7 +81,13 @@ impl GeneratedReport<'_> {
             let s = m.synthesis;
             let nearest = s.shares.iter().max_by(|a, b| a.1.total_cmp(&b.1));
             let nearest = nearest.map_or("\u{2013}".to_string(), |(subject, share)| format!("{subject} ({:.0} %)", 100.0 * share));
-            vec![m.file.to_string(), nearest, format!("{:.3}", s.parameter), format!("{:.3}", s.frequency_hz), m.clip.poses.len().to_string()]
+            vec![
+                m.file.to_string(),
+                nearest,
+                format!("{:.3}", s.parameter),
+                format!("{:.3}", s.frequency_hz),
+                m.clip.poses.len().to_string(),
+            ]
         };
         let rows: Vec<Vec<String>> = self.made.iter().map(row).collect();
         let parameter = format!("{} ({})", if self.model.activity.is_cyclic() { "speed" } else { "length" }, self.unit());
@@ -99,7 +108,12 @@ impl GeneratedReport<'_> {
     /// Table over the motions, and the right leg's angles.
     fn gait(&self, gaits: &[Gait]) -> Markup {
         let tables: Vec<_> = gaits.iter().map(|g| g.table(true)).collect();
-        let cell = |m: Option<Measure>, unit: &str| m.map_or("\u{2013}".into(), |m| if unit.starts_with("share") { format!("{:.1}", 100.0 * m.mean) } else { format!("{:.3}", m.mean) });
+        let cell = |m: Option<Measure>, unit: &str| {
+            m.map_or(
+                "\u{2013}".into(),
+                |m| if unit.starts_with("share") { format!("{:.1}", 100.0 * m.mean) } else { format!("{:.3}", m.mean) },
+            )
+        };
         let rows: Vec<Vec<String>> = (0..tables.first().map_or(0, Vec::len))
             .map(|k| {
                 let line = &tables[0][k];
@@ -109,7 +123,8 @@ impl GeneratedReport<'_> {
             .collect();
         let labels: Vec<String> = self.made.iter().map(|m| format!("{:.2} {}", m.synthesis.parameter, self.unit())).collect();
         let head: Vec<&str> = ["", "unit"].into_iter().chain(labels.iter().map(String::as_str)).collect();
-        let charts = ["Hip flexion", "Knee flexion", "Ankle dorsiflexion"].iter().enumerate().map(|(j, name)| self.angles(gaits, &labels, j, name));
+        let charts =
+            ["Hip flexion", "Knee flexion", "Ankle dorsiflexion"].iter().enumerate().map(|(j, name)| self.angles(gaits, &labels, j, name));
         html! {
             (table(&head, &rows, 2))
             (gallery(&charts.collect::<Vec<_>>()))
@@ -147,7 +162,10 @@ impl GeneratedReport<'_> {
         let mut rows = vec![
             ("style", self.style_name.to_string()),
             ("seen at", format!("{:.3} {}, hip joints at {:.3} m", style.parameter, self.unit(), style.hip_height_m)),
-            ("model", format!("{}: {}, {} cycles of {} subjects", self.model_name, model.activity, model.members.len(), model.subjects().len())),
+            (
+                "model",
+                format!("{}: {}, {} cycles of {} subjects", self.model_name, model.activity, model.members.len(), model.subjects().len()),
+            ),
             ("model's hash", style.model_hash.clone()),
         ];
         rows.extend(self.options.iter().cloned());

@@ -85,10 +85,8 @@ fn side(joint: Joint) -> &'static str {
 }
 
 fn skeleton(nodes: &[Option<[f64; 2]>; NODES]) -> Markup {
-    let bones: Vec<_> = Joint::ALL
-        .into_iter()
-        .filter_map(|joint| Some((side(joint), nodes[joint.parent()? as usize]?, nodes[joint as usize]?)))
-        .collect();
+    let bones: Vec<_> =
+        Joint::ALL.into_iter().filter_map(|joint| Some((side(joint), nodes[joint.parent()? as usize]?, nodes[joint as usize]?))).collect();
     let path = |which: &str| {
         let own = bones.iter().filter(|b| which.is_empty() || b.0 == which);
         own.fold(String::new(), |mut text, (_, a, b)| {

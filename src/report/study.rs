@@ -56,8 +56,7 @@ pub fn html(study: &Study) -> String {
 
 fn verdict(study: &Study) -> Verdict {
     let count = |state: &str| study.rows.iter().filter(|r| rank(r.state) == rank(state)).count();
-    let words: Vec<String> =
-        ORDER.iter().rev().filter(|s| count(s) > 0).map(|s| format!("{} {s}", count(s))).collect();
+    let words: Vec<String> = ORDER.iter().rev().filter(|s| count(s) > 0).map(|s| format!("{} {s}", count(s))).collect();
     let sentence = match study.rows.len() {
         0 => "No sessions.".to_string(),
         n => format!("{n} sessions: {}.", words.join(", ")),

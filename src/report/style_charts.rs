@@ -76,9 +76,8 @@ pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
 fn weights(model: &Model, style: &Style, uncertainty: &[f64]) -> Markup {
     let of = |known: bool| {
         let chosen = (0..style.weights.len()).filter(|i| uncertainty.get(*i).is_none_or(|u| *u < KNOWN) == known);
-        let rows: Vec<([f64; 2], f64)> = chosen
-            .map(|i| ([(i + 1) as f64, style.weights[i] / scale(model, i)], BAND * sigma(style, i) / scale(model, i)))
-            .collect();
+        let rows: Vec<([f64; 2], f64)> =
+            chosen.map(|i| ([(i + 1) as f64, style.weights[i] / scale(model, i)], BAND * sigma(style, i) / scale(model, i))).collect();
         let (points, bars) = rows.into_iter().unzip();
         let label = if known { "known, with 95 % interval" } else { "hardly seen" };
         Dots { label: label.into(), points, bars, colour: if known { 0 } else { 6 }, radius: 3.2 }

@@ -5,7 +5,7 @@ use image::{GrayImage, RgbImage};
 use maud::{Markup, html};
 use nalgebra::Vector3;
 
-use super::page::{Grade, Section, Verdict, facts, gallery, page, png_uri, picture, table, tiles};
+use super::page::{Grade, Section, Verdict, facts, gallery, page, picture, png_uri, table, tiles};
 use super::walk::Walk;
 use super::{CloudDot, ReportError, cloud_and_body, person, person_depth, style_charts, track_charts, view3d, walk};
 use crate::body::{Joint, Placement, PosedSurface, Surface, place};
@@ -53,10 +53,8 @@ impl TrackReport<'_> {
     pub fn html(&self) -> Result<String, ReportError> {
         let offsets = self.fit.shape().offsets();
         let placements: Vec<Placement> = self.fit.poses.iter().map(|pose| place(&offsets, pose)).collect();
-        let mut sections = vec![
-            Section::new("Pictures", self.overlays(&placements)?),
-            Section::new("Points and depth", self.clouds(&placements)?),
-        ];
+        let mut sections =
+            vec![Section::new("Pictures", self.overlays(&placements)?), Section::new("Points and depth", self.clouds(&placements)?)];
         if let Some(walk) = self.walk {
             sections.push(Section::new("Gait", walk::section(walk)));
         }
@@ -184,8 +182,7 @@ impl TrackReport<'_> {
             .filter(|(_, u)| u.is_nan() || **u >= KNOWN)
             .map(|(i, _)| (i + 1).to_string())
             .collect();
-        let empty: Vec<String> =
-            self.observations.iter().filter(|o| o.cloud.points.is_empty()).map(|o| o.number.to_string()).collect();
+        let empty: Vec<String> = self.observations.iter().filter(|o| o.cloud.points.is_empty()).map(|o| o.number.to_string()).collect();
         let few: Vec<String> = self.left_to_neighbours().iter().map(usize::to_string).collect();
         let list = |items: &[String], none: &str| if items.is_empty() { none.to_string() } else { items.join(", ") };
         html! {
@@ -218,8 +215,7 @@ impl TrackReport<'_> {
     fn facts(&self) -> Markup {
         let (fit, shape) = (self.fit, self.fit.shape());
         let sigma = shape.stature_m * fit.shared_variance(fit.state.layout().stature()).sqrt();
-        let cameras: Vec<String> =
-            self.rig.cameras.iter().map(|c| format!("{} {}x{}", c.name, c.size_px[0], c.size_px[1])).collect();
+        let cameras: Vec<String> = self.rig.cameras.iter().map(|c| format!("{} {}x{}", c.name, c.size_px[0], c.size_px[1])).collect();
         let points: usize = self.observations.iter().map(|o| o.cloud.points.len()).sum();
         let used: usize = fit.frames.iter().map(|f| f.inliers).sum();
         let mut rows = vec![
@@ -227,10 +223,29 @@ impl TrackReport<'_> {
             ("cameras", cameras.join(", ")),
             ("frames", format!("{} at {} frames/s", self.observations.len(), self.fps)),
             ("cloud points", format!("{points}, of which the last stage of the fit took a share and {used} lie at the body")),
-            ("model", format!("{}: {}, {} cycles of {} subjects", self.model_name, self.model.activity, self.model.members.len(), self.model.subjects().len())),
+            (
+                "model",
+                format!(
+                    "{}: {}, {} cycles of {} subjects",
+                    self.model_name,
+                    self.model.activity,
+                    self.model.members.len(),
+                    self.model.subjects().len()
+                ),
+            ),
             ("model's hash", self.model_hash.to_string()),
-            ("body", format!("stature {:.3} m (standard deviation {sigma:.3}), hip joints at {:.3} m", shape.stature_m, shape.hip_height_m())),
-            ("leaves the model", if fit.state.deviations.is_empty() { "no".into() } else { "yes, single joints turn against it where that explains left-out points better".into() }),
+            (
+                "body",
+                format!("stature {:.3} m (standard deviation {sigma:.3}), hip joints at {:.3} m", shape.stature_m, shape.hip_height_m()),
+            ),
+            (
+                "leaves the model",
+                if fit.state.deviations.is_empty() {
+                    "no".into()
+                } else {
+                    "yes, single joints turn against it where that explains left-out points better".into()
+                },
+            ),
             ("iterations", fit.iterations.to_string()),
         ];
         rows.extend(self.options.iter().cloned());

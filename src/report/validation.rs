@@ -112,7 +112,14 @@ impl ValidationReport<'_> {
         let top = places(false).iter().chain(&places(true)).map(|p| p[1]).fold(0.0, f64::max);
         Chart {
             title: metric.into(),
-            y_label: if metric == "rms_deg" { "degrees" } else if metric == "rms_mm" { "mm" } else { "distance" }.into(),
+            y_label: if metric == "rms_deg" {
+                "degrees"
+            } else if metric == "rms_mm" {
+                "mm"
+            } else {
+                "distance"
+            }
+            .into(),
             x_range: Some([-0.5, methods.len() as f64 - 0.5]),
             y_range: Some([0.0, 1.06 * top.max(1e-9)]),
             dots: vec![

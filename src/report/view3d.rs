@@ -80,8 +80,7 @@ fn scene(view: &View) -> Value {
         [b'r', b'_', ..] => 1,
         _ => 2,
     };
-    let bones: Vec<[usize; 3]> =
-        Joint::ALL.into_iter().filter_map(|j| Some([j.parent()? as usize, j as usize, side(j)])).collect();
+    let bones: Vec<[usize; 3]> = Joint::ALL.into_iter().filter_map(|j| Some([j.parent()? as usize, j as usize, side(j)])).collect();
     let instants: Vec<Value> = view.instants.iter().map(instant).collect();
     let up = view.up.direction();
     json!({

@@ -78,7 +78,8 @@ pub fn run(args: &RunArgs) -> Result<()> {
         ),
     }
     let source = [("video", &study.video), ("masks", &study.masks), ("strokes", &study.strokes)];
-    let mut facts: Vec<(&str, String)> = source.iter().filter_map(|(what, path)| Some((*what, path.as_ref()?.display().to_string()))).collect();
+    let mut facts: Vec<(&str, String)> =
+        source.iter().filter_map(|(what, path)| Some((*what, path.as_ref()?.display().to_string()))).collect();
     facts.extend([("[silhouettes]", json(&study.silhouettes)?), ("[analyse]", json(&study.analyse)?), ("[keys]", json(&study.keys)?)]);
     if let Some(animate) = &study.animate {
         facts.push(("[animate]", json(animate)?));
