@@ -99,7 +99,7 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     let tracked = track(&session, &model, &options)?;
     write(&args.output, &session, &model, &tracked)?;
     if !args.no_report {
-        track_report::write(&args.output, &args.session.display().to_string(), &session, &model, &tracked)?;
+        track_report::write(&args.output, &session, &model, &tracked)?;
     }
     if args.pictures {
         draw(&args.output.join("pictures"), &session.rig, &model, &tracked)?;

@@ -11,9 +11,12 @@ use muybridge::report::walk::Walk;
 
 use super::track::{NamedModel, Tracked, clip, style};
 
-/// Writes report.html, thumbnail.jpg and, for gaits, gait.csv and angles_cycle.csv; the page calls the session `name`.
-pub fn write(folder: &Path, name: &str, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
+/// Writes report.html, thumbnail.jpg and, for gaits, gait.csv and angles_cycle.csv. The page names
+/// the session by its folder alone, so that it is the same wherever the study stands.
+pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
     let Tracked { fit, observations, pictures, depth } = tracked;
+    let whole = session.folder.canonicalize().unwrap_or_else(|_| session.folder.clone());
+    let name = whole.file_name().unwrap_or_default().to_string_lossy();
     let (clip, _) = clip(fit, &session.rig, observations, session.fps)?;
     let walk = Walk::of(fit, &clip, model.model.activity, observations.first().map_or(0.0, |o| o.time_s));
     if let Some(walk) = &walk {
@@ -23,7 +26,7 @@ pub fn write(folder: &Path, name: &str, session: &Session, model: &NamedModel, t
         written(folder, "angles_cycle.csv", |path| gait_csv::write_angles(path, &walk.curves()))?;
     }
     let report = TrackReport {
-        session: name,
+        session: &name,
         rig: &session.rig,
         fps: session.fps,
         model: &model.model,

@@ -157,7 +157,7 @@ fn announce(session: &Session) -> Result<()> {
 /// Writes what `track` and `generate` write.
 fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<Vec<Generated>> {
     track::write(&folder.join("track"), session, model, tracked)?;
-    track_report::write(&folder.join("track"), "the demo's session", session, model, tracked)?;
+    track_report::write(&folder.join("track"), session, model, tracked)?;
     let style = track::style(&tracked.fit, model);
     let offsets = tracked.fit.shape().offsets();
     let one = |kmh: f64| {
