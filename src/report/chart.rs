@@ -7,7 +7,7 @@ use maud::{Markup, html};
 use super::canvas::{tick_label, ticks};
 use super::curves::Curve;
 
-const WIDTH: f64 = 460.0;
+const WIDTH: f64 = 400.0;
 const LEFT: f64 = 46.0;
 const RIGHT: f64 = 12.0;
 const TOP: f64 = 24.0;
@@ -46,7 +46,7 @@ pub struct Chart {
     pub ticks: Vec<(f64, String)>,
     /// Dotted lines upwards, with colour.
     pub marks: Vec<(f64, usize)>,
-    /// Of the drawing; 270 where zero.
+    /// Of the drawing; 250 where zero.
     pub height: f64,
     pub caption: String,
 }
@@ -101,10 +101,10 @@ impl Chart {
     }
 
     fn frame(&self) -> Frame {
-        let height = if self.height > 0.0 { self.height } else { 270.0 };
+        let height = if self.height > 0.0 { self.height } else { 250.0 };
         let curves = || self.curves.iter().chain(&self.faint);
         let along = curves().flat_map(|c| &c.points).chain(self.dots.iter().flat_map(|d| &d.points)).map(|p| p[0]);
-        let x = self.x_range.unwrap_or_else(|| range(along, 0.0));
+        let x = self.x_range.unwrap_or_else(|| range(along, if self.dots.is_empty() { 0.0 } else { 0.03 }));
         let reach = |points: &[[f64; 2]], bars: &[f64]| -> Vec<f64> {
             let bar = |i: usize| bars.get(i).copied().filter(|b| b.is_finite()).unwrap_or(0.0);
             points.iter().enumerate().flat_map(|(i, p)| [p[1] - bar(i), p[1] + bar(i)]).collect()
@@ -242,10 +242,10 @@ mod tests {
         let chart =
             Chart { title: "<t>".into(), curves: vec![curve], x_range: Some([0.0, 4.0]), y_range: Some([0.0, 2.0]), ..Chart::default() };
         let text = chart.figure().into_string();
-        // The drawing is 402 by 206.
-        assert!(text.contains("d=\"M0 206L100.5 103M301.5 103L402 0\""), "{text}");
+        // The drawing is 342 by 186.
+        assert!(text.contains("d=\"M0 186L85.5 93M256.5 93L342 0\""), "{text}");
         assert_eq!(text.matches("class=\"band f1\"").count(), 2);
-        assert!(text.contains("d=\"M0 154.5L100.5 51.5L100.5 154.5L0 257.5Z\""), "{text}");
+        assert!(text.contains("d=\"M0 139.5L85.5 46.5L85.5 139.5L0 232.5Z\""), "{text}");
         assert!(text.contains("a &amp; b") && text.contains("&lt;t&gt;") && !text.contains("<t>"));
     }
 
@@ -254,7 +254,7 @@ mod tests {
         let dots = Dots { points: vec![[1.0, 1.0], [f64::NAN, 0.0]], bars: vec![0.5, 0.1], radius: 3.0, ..Dots::default() };
         let chart = Chart { dots: vec![dots], x_range: Some([0.0, 2.0]), y_range: Some([0.0, 2.0]), ..Chart::default() };
         let text = chart.figure().into_string();
-        assert!(text.contains("x1=\"201\" y1=\"154.5\" x2=\"201\" y2=\"51.5\"") && text.contains("cx=\"201\" cy=\"103\""), "{text}");
+        assert!(text.contains("x1=\"171\" y1=\"139.5\" x2=\"171\" y2=\"46.5\"") && text.contains("cx=\"171\" cy=\"93\""), "{text}");
         assert_eq!(text.matches("<circle").count(), 1);
         assert!(Chart::default().figure().into_string().contains("class=\"tick\""));
     }

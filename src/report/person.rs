@@ -20,18 +20,30 @@ const THIN: usize = 3;
 /// Part of a camera's picture: left, top, width, height in px.
 pub type Crop = [u32; 4];
 
-/// The part of a camera's picture that holds these bodies; the whole picture where none is in it.
-pub fn crop<'a>(camera: &Camera, bodies: impl Iterator<Item = &'a [Vector3<f64>; NODES]>) -> Crop {
+/// Where the joints of a body lie in a camera's picture: low and high corner; `None` where it is out of view.
+fn bounds(camera: &Camera, body: &[Vector3<f64>; NODES]) -> Option<[f64; 4]> {
     let [width, height] = camera.size_px.map(f64::from);
-    let seen = bodies.flatten().filter_map(|x| camera.project(x)).filter(|p| (0.0..width).contains(&p.x) && (0.0..height).contains(&p.y));
+    let seen = body.iter().filter_map(|x| camera.project(x)).filter(|p| (0.0..width).contains(&p.x) && (0.0..height).contains(&p.y));
     let none = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
-    let [x0, y0, x1, y1] = seen.fold(none, |[a, b, c, d], p| [a.min(p.x), b.min(p.y), c.max(p.x), d.max(p.y)]);
-    if x0 > x1 {
-        return [0, 0, camera.size_px[0], camera.size_px[1]];
-    }
-    let (left, top) = ((x0 - MARGIN_PX).max(0.0), (y0 - MARGIN_PX).max(0.0));
-    let (right, bottom) = ((x1 + MARGIN_PX).min(width), (y1 + MARGIN_PX).min(height));
-    [left as u32, top as u32, (right - left).ceil() as u32, (bottom - top).ceil() as u32]
+    let found = seen.fold(none, |[a, b, c, d], p| [a.min(p.x), b.min(p.y), c.max(p.x), d.max(p.y)]);
+    (found[0] <= found[2]).then_some(found)
+}
+
+/// Parts of a camera's picture, all of one size, each around one of the bodies; the whole picture for a body out of view.
+pub fn crops(camera: &Camera, bodies: &[&[Vector3<f64>; NODES]]) -> Vec<Crop> {
+    let [width, height] = camera.size_px.map(f64::from);
+    let found: Vec<Option<[f64; 4]>> = bodies.iter().map(|body| bounds(camera, body)).collect();
+    let reach = |low: usize, most: f64| {
+        let widest = found.iter().flatten().map(|b| b[low + 2] - b[low]).fold(0.0, f64::max);
+        (widest + 2.0 * MARGIN_PX).ceil().min(most)
+    };
+    let size = [reach(0, width), reach(1, height)];
+    let one = |bounds: &Option<[f64; 4]>| {
+        let Some(b) = bounds else { return [0, 0, camera.size_px[0], camera.size_px[1]] };
+        let start = |k: usize, most: f64| (0.5 * (b[k] + b[k + 2] - size[k])).clamp(0.0, most - size[k]) as u32;
+        [start(0, width), start(1, height), size[0] as u32, size[1] as u32]
+    };
+    found.iter().map(one).collect()
 }
 
 /// A crop of the picture with the skeleton at `positions` and the outline of `mask`.
@@ -124,9 +136,13 @@ mod tests {
         };
         let shape = Shape::template(1.7);
         let placed = place(&shape.offsets(), &Pose::rest(shape.offsets()[0]));
-        let part = crop(&camera, std::iter::once(&placed.positions));
-        // 1.55 m of joints at 4 m are 194 px high.
-        assert!((200..280).contains(&part[3]) && part[2] < 160, "{part:?}");
+        let mut farther = placed.positions;
+        farther.iter_mut().for_each(|x| x.x += 0.6);
+        let parts = crops(&camera, &[&placed.positions, &farther]);
+        let part = parts[0];
+        // 1.55 m of joints at 4 m are 194 px high; 0.6 m there are 75 px.
+        assert!((200..280).contains(&part[3]) && part[2] < 160 && parts[1][2..] == part[2..], "{parts:?}");
+        assert!((74..=76).contains(&(parts[1][0] - part[0])) && parts[1][1] == part[1], "{parts:?}");
         let mask = silhouette(&Surface::new(&shape), &shape.offsets(), &placed, &camera);
         let text = figure(&GrayImage::new(640, 480), &camera, &placed.positions, &mask, part, "a < b").unwrap().into_string();
         let knee = camera.project(&placed.position(Joint::LKnee)).unwrap();
@@ -134,6 +150,6 @@ mod tests {
         assert!(text.contains(&format!("class=\"joint left\" cx=\"{}\" cy=\"{}\"", at[0], at[1])), "{text}");
         assert!(text.contains("a &lt; b") && text.matches("class=\"joint").count() == NODES - 1);
         let behind = Camera { translation: Vector3::new(0.0, 0.9, -4.0), ..camera };
-        assert_eq!(crop(&behind, std::iter::once(&placed.positions)), [0, 0, 640, 480]);
+        assert_eq!(crops(&behind, &[&placed.positions]), [[0, 0, 640, 480]]);
     }
 }

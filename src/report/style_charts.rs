@@ -65,7 +65,7 @@ pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
         curves: vec![Curve { label: String::new(), points, dashed: false, colour: INK, band: Vec::new() }],
         dots,
         names,
-        height: 330.0,
+        height: 300.0,
         caption: "First two weights of every cycle of the database, named by subject.".into(),
         ..Chart::default()
     }
@@ -89,8 +89,8 @@ fn weights(model: &Model, style: &Style, uncertainty: &[f64]) -> Markup {
         y_label: "standard deviations of the database".into(),
         x_range: Some([0.0, style.weights.len() as f64 + 1.0]),
         dots,
-        height: 330.0,
-        caption: "Hardly seen: the interval is wider than half the database's spread.".into(),
+        height: 300.0,
+        caption: "Hardly seen: a standard deviation wider than half the database's.".into(),
         ..Chart::default()
     }
     .figure()

@@ -8,7 +8,7 @@ use nalgebra::Vector3;
 use super::page::{Grade, Section, Verdict, facts, gallery, page, picture, png_uri, table, tiles};
 use super::walk::Walk;
 use super::{CloudDot, ReportError, cloud_and_body, person, person_depth, style_charts, track_charts, view3d, walk};
-use crate::body::{Joint, Placement, PosedSurface, Surface, place};
+use crate::body::{Joint, NODES, Placement, PosedSurface, Surface, place};
 use crate::fit::{Fit, Observation};
 use crate::io::joints_csv;
 use crate::motion_model::Model;
@@ -124,9 +124,9 @@ impl TrackReport<'_> {
         let shown: Vec<_> = self.pictures.iter().filter(|(t, _)| *t < placements.len()).collect();
         let mut cameras = Vec::new();
         for (k, camera) in self.rig.cameras.iter().enumerate() {
-            let part = person::crop(camera, shown.iter().map(|(t, _)| &placements[*t].positions));
+            let bodies: Vec<&[Vector3<f64>; NODES]> = shown.iter().map(|(t, _)| &placements[*t].positions).collect();
             let mut figures = Vec::new();
-            for (t, views) in &shown {
+            for ((t, views), part) in shown.iter().zip(person::crops(camera, &bodies)) {
                 let (Some(view), o) = (views.get(k), &self.observations[*t]) else { continue };
                 let mask = phantom::silhouette(&surface, &offsets, &placements[*t], camera);
                 let caption = format!("frame {}, {:.2} s", o.number, o.time_s);

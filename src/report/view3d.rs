@@ -95,7 +95,7 @@ fn scene(view: &View) -> Value {
 /// Above the horizon a little, at plotly's distance.
 fn eye(towards_viewer: &Vector3<f64>, up: &Vector3<f64>) -> [f64; 3] {
     let level = (towards_viewer - up * towards_viewer.dot(up)).try_normalize(1e-9).unwrap_or_else(|| up.yzx());
-    let eye = level * 1.5 + up * 0.35;
+    let eye = level * 2.1 + up * 0.4;
     [eye.x, eye.y, eye.z].map(|v| (v * 1000.0).round() / 1000.0)
 }
 

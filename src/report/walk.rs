@@ -46,9 +46,13 @@ impl Walk {
         Some(Walk { filmed, strides, cycle, legs, start_s, walks: activity == Activity::Walking })
     }
 
-    /// Tables of the footage and of the cycle.
+    /// Tables of the footage and of the cycle; what is alike in every cycle has no spread.
     pub fn tables(&self) -> [(&'static str, Vec<Line>); 2] {
-        [("filmed", self.filmed.table(self.walks)), ("cycle", self.cycle.table(self.walks))]
+        let mut cycle = self.cycle.table(self.walks);
+        for line in &mut cycle {
+            line.sides.iter_mut().chain([&mut line.both]).flatten().for_each(|m| (m.sd, m.n) = (None, 1));
+        }
+        [("filmed", self.filmed.table(self.walks)), ("cycle", cycle)]
     }
 
     /// Curves for `angles_cycle.csv`.
@@ -72,11 +76,11 @@ pub(super) fn section(walk: &Walk) -> Markup {
             "Heel strikes and toe-offs after Zeni et al. (2008). The footage shows " (count(0)) " whole strides of the left and "
             (count(1)) " of the right foot. The fitted cycle is the same person walking on steadily, so that both sides are whole however short the footage."
         }
-        h3 { "In the footage" }
-        (lines(&filmed))
-        h3 { "Of the fitted cycle" }
-        (lines(&cycle))
-        p.small.soft { "Mean and, from two values on, standard deviation between strides. Asymmetry: 100 (left - right) / mean. Shares are of the gait cycle." }
+        div.gallery.halves {
+            div { h3 { "In the footage" } (lines(&filmed)) }
+            div { h3 { "Of the fitted cycle" } (lines(&cycle)) }
+        }
+        p.small.soft { "Mean and, from two strides or steps on, standard deviation. Asymmetry: 100 (left - right) / mean. Shares are of the gait cycle." }
         (gallery(&[angles(walk, 0), angles(walk, 1), angles(walk, 2)]))
         (events(walk))
     }
@@ -94,8 +98,12 @@ pub(super) fn lines(lines: &[Line]) -> Markup {
     let asymmetry = |line: &Line| line.asymmetry_percent().map_or("\u{2013}".into(), |a| format!("{a:+.1} %"));
     let rows: Vec<Vec<String>> = lines
         .iter()
+        .filter(|l| l.both.is_some())
         .map(|l| vec![l.name.to_string(), unit(l), cell(l, l.sides[0]), cell(l, l.sides[1]), asymmetry(l), cell(l, l.both)])
         .collect();
+    if rows.is_empty() {
+        return html! { p { "Too short for a step." } };
+    }
     table(&["", "unit", "left", "right", "asymmetry", "both"], &rows, 2)
 }
 
