@@ -19,6 +19,7 @@ mod progress;
 mod render;
 mod rig;
 mod track;
+mod track_report;
 mod whole;
 
 use anyhow::Result;

@@ -15,6 +15,7 @@ pub mod exchange;
 pub mod fit_checkpoint;
 pub mod fit_json;
 pub mod frame_cloud;
+pub mod gait_csv;
 pub mod glb;
 pub mod images;
 pub mod joints_csv;
