@@ -9,5 +9,5 @@ pub mod synthetic;
 
 pub use cadence::CadenceLaw;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
-pub use model::{Member, Model, ModelError};
+pub use model::{Detail, Member, Model, ModelError};
 pub use segment::{Label, Segments, segment};
