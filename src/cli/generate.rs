@@ -3,7 +3,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use muybridge::body::Shape;
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
@@ -13,7 +13,7 @@ use muybridge::io::{is_motion_file, write_atomic};
 use muybridge::motion::{Length, Synthesis, play, synthesize};
 use muybridge::motion_model::{Activity, Cycle, Model};
 use muybridge::report::generated::{self, GeneratedReport};
-use muybridge::style::{Metric, Population, Style};
+use muybridge::style::{Method, Metric, Population, Style};
 
 use super::model::default_variance;
 use super::motions::{file_name, read_recordings};
@@ -45,10 +45,14 @@ pub struct GenerateArgs {
     /// Hip-joint height in metres of the body that moves
     #[arg(long, value_parser = super::positive)]
     leg_length: Option<f64>,
-    /// Part of the variance that the components in use hold; 0.90 for walking, else 0.95
+    /// How the style is carried: `default` keeps the person's own motion and adds the change of like people, `paper` is the
+    /// weighted sum of the database's people
+    #[arg(long, value_enum, default_value = "default")]
+    method: MethodName,
+    /// Part of the variance that the components in use hold; all the style has, for `--method paper` 0.90 of walking, else 0.95
     #[arg(long, value_parser = super::part)]
     variance: Option<f64>,
-    /// Weigh database subjects by the true Mahalanobis distance in place of the paper's
+    /// With `--method paper`: weigh database subjects by the true Mahalanobis distance in place of the paper's
     #[arg(long)]
     mahalanobis: bool,
     /// Gait cycles per motion
@@ -64,21 +68,37 @@ pub struct GenerateArgs {
     files: OutputArgs,
 }
 
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum MethodName {
+    Default,
+    Paper,
+}
+
+fn method(args: &GenerateArgs) -> Result<Method> {
+    match (args.method, args.mahalanobis) {
+        (MethodName::Default, false) => Ok(Method::Default),
+        (MethodName::Paper, false) => Ok(Method::Paper(Metric::Paper)),
+        (MethodName::Paper, true) => Ok(Method::Paper(Metric::Mahalanobis)),
+        (MethodName::Default, true) => bail!("--mahalanobis is a distance of --method paper; give both"),
+    }
+}
+
 pub fn run(args: GenerateArgs) -> Result<()> {
     let model = read_model(&args.model)?;
     let values: Vec<f64> = args.at.iter().map(|v| parameter(v, model.activity)).collect::<Result<_>>()?;
     let names = file_names(model.activity, &values)?;
     let style = load_style(&args, &model)?;
     let shape = target_shape(&args, &style);
-    let metric = if args.mahalanobis { Metric::Mahalanobis } else { Metric::Paper };
-    let wanted = model.components(args.variance.unwrap_or(default_variance(model.activity)));
+    let method = method(&args)?;
+    let part = args.variance.or_else(|| (method != Method::Default).then(|| default_variance(model.activity)));
+    let wanted = part.map_or(style.weights.len(), |v| model.components(v));
     let population = Population::new(&model, wanted.min(style.weights.len()));
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
     let mut syntheses = Vec::new();
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
     let mut motions = Vec::new();
     for (value, name) in values.iter().zip(&names) {
-        let synthesis = synthesize(&model, &population, metric, &style, *value, shape.hip_height_m())?;
+        let synthesis = synthesize(&model, &population, method, &style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
             eprintln!("notice: {name}: {notice}");
         }
@@ -105,7 +125,7 @@ fn report(args: &GenerateArgs, model: &Model, style: &Style, made: Vec<generated
         style_name: &args.style.display().to_string(),
         made,
         options: &[
-            ("weighing", if args.mahalanobis { "Mahalanobis" } else { "the paper's" }.to_string()),
+            ("method", method(args)?.to_string()),
             ("frames per second", args.fps.to_string()),
         ],
     };
