@@ -12,6 +12,7 @@ mod interrupt;
 mod model;
 mod motions;
 mod observe;
+mod profile;
 mod progress;
 mod render;
 mod rig;

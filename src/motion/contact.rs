@@ -1,0 +1,118 @@
+//! When a foot of a motion stands on the floor, and how it slides while it does.
+//!
+//! A sole is its heel, ball and toe tip p_i. What touches is the lowest of them, softly: w_i ∝ exp(−(y_i − y_min)/σ), so a
+//! foot that rolls from heel to toe stands still at each moment where it touches, and the slide from one frame to the next is
+//!   s = Σ_i w_i Δp_i                                                                                               (1)
+//! A foot stands where its lowest point is near its own floor and (1) is slow against the person's travel.
+//! Fails when: a sole is dragged over the floor as fast as the person goes; that is no stance.
+//! Checked against the contacts that synthetic people are made with.
+
+use std::ops::Range;
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use crate::body::{Clip, Joint};
+use crate::math::order::quantile;
+
+/// σ of the weights, metres. Smaller hands over from heel to ball within a frame, larger lets lifted heels count.
+const TOUCH_M: f64 = 0.006;
+/// Height over the foot's floor, in hip heights.
+const NEAR: f64 = 0.03;
+/// Speed of a standing sole: a part of the person's travel, and m/s on top.
+const SLOW: (f64, f64) = (0.25, 0.15);
+/// Gaps that are closed and contacts that are dropped as too short, seconds.
+const GAP_S: f64 = 0.04;
+const SHORTEST_S: f64 = 0.06;
+/// The person's speed is taken over this time, seconds.
+const TRAVEL_S: f64 = 0.5;
+
+/// A foot over the frames of a clip.
+#[derive(Clone, Debug)]
+pub struct FootTrack {
+    pub ankle: Joint,
+    pub ankles: Vec<Vector3<f64>>,
+    pub world_from_foot: Vec<UnitQuaternion<f64>>,
+    /// Heel, ball and toe tip, see [`Clip::sole_points`].
+    pub soles: Vec<[Vector3<f64>; 3]>,
+}
+
+impl FootTrack {
+    /// Of the foot of `ankle`, LAnkle or RAnkle.
+    pub fn new(clip: &Clip, ankle: Joint) -> FootTrack {
+        let mut track = FootTrack { ankle, ankles: Vec::new(), world_from_foot: Vec::new(), soles: Vec::new() };
+        for pose in &clip.poses {
+            let placed = clip.place(pose);
+            track.ankles.push(placed.position(ankle));
+            track.world_from_foot.push(placed.world_from_node[ankle as usize]);
+            track.soles.push(clip.sole_points(&placed, ankle));
+        }
+        track
+    }
+
+    /// Height of what touches.
+    pub fn height_m(&self, frame: usize) -> f64 {
+        weights(&self.soles[frame]).iter().zip(&self.soles[frame]).map(|(w, p)| w * p.y).sum()
+    }
+
+    /// Slide (1) from `frame` to the next, metres.
+    pub fn slide(&self, frame: usize) -> Vector3<f64> {
+        let (here, there) = (&self.soles[frame], &self.soles[frame + 1]);
+        let (u, v) = (weights(here), weights(there));
+        (0..3).map(|i| (there[i] - here[i]) * (0.5 * (u[i] + v[i]))).sum()
+    }
+
+    /// Turn about the vertical from `frame` to the next.
+    pub fn turn(&self, frame: usize) -> f64 {
+        crate::math::rotation::log(&(self.world_from_foot[frame + 1] * self.world_from_foot[frame].inverse())).y
+    }
+
+    /// Frames in which the foot stands.
+    pub fn contacts(&self, clip: &Clip) -> Vec<Range<usize>> {
+        let frames = self.soles.len();
+        if frames < 2 {
+            return Vec::new();
+        }
+        let lowest: Vec<f64> = self.soles.iter().map(|s| s.iter().map(|p| p.y).fold(f64::INFINITY, f64::min)).collect();
+        let floor = quantile(lowest.clone(), 0.05).unwrap_or(0.0);
+        let stands = |frame: usize| {
+            let speed = self.slide(frame.min(frames - 2)).xz().norm() * clip.fps;
+            lowest[frame] < floor + NEAR * clip.hip_height_m && speed < SLOW.0 * travel_m_s(clip, frame) + SLOW.1
+        };
+        tidy((0..frames).map(stands).collect(), clip.fps)
+    }
+}
+
+/// Weights w_i of the points of a sole.
+fn weights(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
+    let lowest = sole.iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
+    let raw = sole.map(|p| (-(p.y - lowest) / TOUCH_M).exp());
+    let sum: f64 = raw.iter().sum();
+    raw.map(|w| w / sum)
+}
+
+/// Speed of the root over the floor around a frame.
+fn travel_m_s(clip: &Clip, frame: usize) -> f64 {
+    let half = (0.5 * TRAVEL_S * clip.fps) as usize + 1;
+    let (from, to) = (frame.saturating_sub(half), (frame + half).min(clip.poses.len() - 1));
+    (clip.poses[to].root - clip.poses[from].root).xz().norm() * clip.fps / (to - from).max(1) as f64
+}
+
+/// Runs of frames, short gaps closed, then short runs dropped.
+fn tidy(mut stands: Vec<bool>, fps: f64) -> Vec<Range<usize>> {
+    let gap = (GAP_S * fps).ceil() as usize;
+    let shortest = (SHORTEST_S * fps).ceil() as usize;
+    let closed: Vec<Range<usize>> = runs(&stands, false).into_iter().filter(|r| r.start > 0 && r.end < stands.len()).collect();
+    closed.into_iter().filter(|r| r.len() <= gap).for_each(|r| stands[r].fill(true));
+    runs(&stands, true).into_iter().filter(|r| r.len() >= shortest).collect()
+}
+
+fn runs(flags: &[bool], wanted: bool) -> Vec<Range<usize>> {
+    let mut found: Vec<Range<usize>> = Vec::new();
+    for i in (0..flags.len()).filter(|i| flags[*i] == wanted) {
+        match found.last_mut() {
+            Some(last) if last.end == i => last.end = i + 1,
+            _ => found.push(i..i + 1),
+        }
+    }
+    found
+}
