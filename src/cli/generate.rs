@@ -9,8 +9,8 @@ use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
 use muybridge::io::style_json::read_style;
 use muybridge::io::{bvh, is_motion_file, write_atomic};
-use muybridge::motion::{Gait, Gaits, Length, Profile, Step, Synthesis, follow, plant_feet, play, synthesize};
 use muybridge::motion::player::ACCELERATION_M_S2;
+use muybridge::motion::{Gait, Gaits, Length, Profile, Step, Synthesis, follow, plant_feet, play, synthesize};
 use muybridge::motion_model::{Activity, Model};
 use muybridge::style::{Metric, Population, Style};
 
@@ -135,7 +135,9 @@ fn along_profile(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shap
     }
     if profile.steepest_m_s2() > ACCELERATION_M_S2 {
         let steepest = profile.steepest_m_s2();
-        eprintln!("notice: the profile changes by up to {steepest:.1} m/s per second; people manage {ACCELERATION_M_S2}, so it is followed late");
+        eprintln!(
+            "notice: the profile changes by up to {steepest:.1} m/s per second; people manage {ACCELERATION_M_S2}, so it is followed late"
+        );
     }
     let (clip, steps) = follow(&gaits, profile, &shape.offsets(), args.fps);
     write(args, "profile.bvh", clip)?;
@@ -158,8 +160,10 @@ fn steps_csv(steps: &[Step]) -> String {
 fn gait(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Result<Gait> {
     let population = population(args, model, style);
     let found = Gait::of_style(model, &population, metric(args), style, shape.hip_height_m(), &shape.offsets())?;
-    let (gait, notices) = found.with_context(|| format!("the speeds of {} make no gait", model.activity))?;
-    notices.iter().for_each(|notice| eprintln!("notice: {notice}"));
+    let (gait, notice) = found.with_context(|| format!("the speeds of {} make no gait", model.activity))?;
+    if let Some(notice) = notice {
+        eprintln!("notice: {notice}");
+    }
     Ok(gait)
 }
 

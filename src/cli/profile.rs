@@ -34,7 +34,8 @@ fn speed_m_s(text: &str) -> Option<f64> {
 
 fn from_csv(text: &str, radius_m: Option<f64>) -> Result<Vec<Waypoint>> {
     let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
-    let header: Vec<&str> = lines.next().map(|(_, l)| l.trim_start_matches('\u{feff}').split(',').map(str::trim).collect()).unwrap_or_default();
+    let header: Vec<&str> =
+        lines.next().map(|(_, l)| l.trim_start_matches('\u{feff}').split(',').map(str::trim).collect()).unwrap_or_default();
     let column = |name: &str| header.iter().position(|h| *h == name);
     let (Some(time), Some(speed)) = (column("time_s"), column("speed_m_s")) else {
         bail!("line 1 must name the columns time_s and speed_m_s, and radius_m for bends");

@@ -3,7 +3,9 @@
 //! A sole is its heel, ball and toe tip p_i. What touches is the lowest of them, softly: w_i ∝ exp(−(y_i − y_min)/σ), so a
 //! foot that rolls from heel to toe stands still at each moment where it touches, and the slide from one frame to the next is
 //!   s = Σ_i w_i Δp_i                                                                                               (1)
-//! A foot stands where its lowest point is near its own floor and (1) is slow against the person's travel.
+//! Recorded feet are tilted against the template's by unknown angles: each point is moved along its foot's vertical so that
+//! it is on the floor in the median of those frames in which it is slow.
+//! A foot stands where its lowest point is near the floor and (1) is slow against the person's travel.
 //! Fails when: a sole is dragged over the floor as fast as the person goes; that is no stance.
 //! Checked against the contacts that synthetic people are made with.
 
@@ -16,13 +18,15 @@ use crate::math::order::quantile;
 
 /// σ of the weights, metres. Smaller hands over from heel to ball within a frame, larger lets lifted heels count.
 const TOUCH_M: f64 = 0.006;
-/// Height over the foot's floor, in hip heights.
-const NEAR: f64 = 0.03;
-/// Speed of a standing sole: a part of the person's travel, and m/s on top.
-const SLOW: (f64, f64) = (0.25, 0.15);
+/// Height over the floor, in hip heights: toes swing through little higher.
+const NEAR: f64 = 0.025;
+/// Speed of a standing sole: a part of the person's travel, and m/s on top. More takes feet that still land for standing.
+const SLOW: (f64, f64) = (0.12, 0.1);
 /// Gaps that are closed and contacts that are dropped as too short, seconds.
 const GAP_S: f64 = 0.04;
 const SHORTEST_S: f64 = 0.06;
+/// Fewer slow frames say nothing about a point's height.
+const FEW: usize = 5;
 /// The person's speed is taken over this time, seconds.
 const TRAVEL_S: f64 = 0.5;
 
@@ -32,7 +36,7 @@ pub struct FootTrack {
     pub ankle: Joint,
     pub ankles: Vec<Vector3<f64>>,
     pub world_from_foot: Vec<UnitQuaternion<f64>>,
-    /// Heel, ball and toe tip, see [`Clip::sole_points`].
+    /// Heel, ball and toe tip, see [`Clip::sole_points`], on the floor while they rest.
     pub soles: Vec<[Vector3<f64>; 3]>,
 }
 
@@ -40,18 +44,31 @@ impl FootTrack {
     /// Of the foot of `ankle`, LAnkle or RAnkle.
     pub fn new(clip: &Clip, ankle: Joint) -> FootTrack {
         let mut track = FootTrack { ankle, ankles: Vec::new(), world_from_foot: Vec::new(), soles: Vec::new() };
+        let ball = if ankle == Joint::LAnkle { Joint::LMidtarsal } else { Joint::RMidtarsal };
+        let mut ups: Vec<[Vector3<f64>; 3]> = Vec::new();
         for pose in &clip.poses {
             let placed = clip.place(pose);
+            let up = |joint: Joint| placed.world_from_node[joint as usize] * Vector3::y();
             track.ankles.push(placed.position(ankle));
             track.world_from_foot.push(placed.world_from_node[ankle as usize]);
             track.soles.push(clip.sole_points(&placed, ankle));
+            ups.push([up(ankle), up(ball), up(ball)]);
+        }
+        for point in 0..3 {
+            let height_m = track.resting_height_m(clip, point);
+            track.soles.iter_mut().zip(&ups).for_each(|(sole, up)| sole[point] -= up[point] * height_m);
         }
         track
     }
 
-    /// Height of what touches.
-    pub fn height_m(&self, frame: usize) -> f64 {
-        weights(&self.soles[frame]).iter().zip(&self.soles[frame]).map(|(w, p)| w * p.y).sum()
+    /// Median height of a point of the sole while it is slow; 0 where it hardly is.
+    fn resting_height_m(&self, clip: &Clip, point: usize) -> f64 {
+        let slow = |frame: usize| {
+            let step = self.soles[frame + 1][point] - self.soles[frame][point];
+            step.xz().norm() * clip.fps < slow_m_s(clip, frame)
+        };
+        let heights: Vec<f64> = (0..self.soles.len().saturating_sub(1)).filter(|k| slow(*k)).map(|k| self.soles[k][point].y).collect();
+        if heights.len() < FEW { 0.0 } else { quantile(heights, 0.5).unwrap_or(0.0) }
     }
 
     /// Slide (1) from `frame` to the next, metres.
@@ -72,11 +89,10 @@ impl FootTrack {
         if frames < 2 {
             return Vec::new();
         }
-        let lowest: Vec<f64> = self.soles.iter().map(|s| s.iter().map(|p| p.y).fold(f64::INFINITY, f64::min)).collect();
-        let floor = quantile(lowest.clone(), 0.05).unwrap_or(0.0);
         let stands = |frame: usize| {
+            let lowest = self.soles[frame].iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
             let speed = self.slide(frame.min(frames - 2)).xz().norm() * clip.fps;
-            lowest[frame] < floor + NEAR * clip.hip_height_m && speed < SLOW.0 * travel_m_s(clip, frame) + SLOW.1
+            lowest < NEAR * clip.hip_height_m && speed < slow_m_s(clip, frame)
         };
         tidy((0..frames).map(stands).collect(), clip.fps)
     }
@@ -90,11 +106,12 @@ fn weights(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
     raw.map(|w| w / sum)
 }
 
-/// Speed of the root over the floor around a frame.
-fn travel_m_s(clip: &Clip, frame: usize) -> f64 {
+/// Below which a sole stands: from the speed of the root over the floor around a frame.
+fn slow_m_s(clip: &Clip, frame: usize) -> f64 {
     let half = (0.5 * TRAVEL_S * clip.fps) as usize + 1;
     let (from, to) = (frame.saturating_sub(half), (frame + half).min(clip.poses.len() - 1));
-    (clip.poses[to].root - clip.poses[from].root).xz().norm() * clip.fps / (to - from).max(1) as f64
+    let travel = (clip.poses[to].root - clip.poses[from].root).xz().norm() * clip.fps / (to - from).max(1) as f64;
+    SLOW.0 * travel + SLOW.1
 }
 
 /// Runs of frames, short gaps closed, then short runs dropped.

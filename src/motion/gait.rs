@@ -1,8 +1,8 @@
 //! One person's gait at every speed, ready to be played: whole cycles at equal steps of speed.
 //!
 //! The cycles of a style change with speed by splines that begin and end where database subjects do, so they may step. Here
-//! they are the control points of a uniform cubic B-spline over speed, which has two continuous derivatives and gives
-//! straight lines back; within a cycle runs the Catmull-Rom spline through the samples:
+//! they are the control points of a uniform cubic B-spline over speed, which has two continuous derivatives, gives straight lines
+//! back and is level at the slowest and fastest speed; within a cycle runs the Catmull-Rom spline through the samples:
 //!   c(v, μ) = Σ_k B_k(v) Σ_j C_j(μ) c_{k,j}                                                                        (1)
 //! A step costs 16 products per channel, however many cycles or components the model has.
 //!
@@ -27,16 +27,8 @@ pub const CHANNELS: usize = DOF + ROOT_CHANNELS;
 /// Distance of the cycles in speed, m/s. Wider flattens a person's change with speed, narrower lets steps of the style
 /// through: (1) spreads one over four of them.
 const STEP_M_S: f64 = 0.1;
-const LEG: [Joint; 8] = [
-    Joint::LHip,
-    Joint::LKnee,
-    Joint::LAnkle,
-    Joint::LMidtarsal,
-    Joint::RHip,
-    Joint::RKnee,
-    Joint::RAnkle,
-    Joint::RMidtarsal,
-];
+const LEG: [Joint; 8] =
+    [Joint::LHip, Joint::LKnee, Joint::LAnkle, Joint::LMidtarsal, Joint::RHip, Joint::RKnee, Joint::RAnkle, Joint::RMidtarsal];
 
 /// One person's walking or running over speed.
 #[derive(Clone, Debug)]
@@ -90,7 +82,7 @@ impl Gait {
         Some(gait)
     }
 
-    /// The gait of `style` over the speeds of its model for a body with `hip_height_m`, and what [`synthesize`] noticed.
+    /// The gait of `style` over the speeds of its model for a body with `hip_height_m`, and what [`synthesize`] noticed first.
     pub fn of_style(
         model: &Model,
         population: &Population,
@@ -98,13 +90,14 @@ impl Gait {
         style: &Style,
         hip_height_m: f64,
         offsets: &[Vector3<f64>; NODES],
-    ) -> Result<Option<(Gait, Vec<String>)>, StyleError> {
+    ) -> Result<Option<(Gait, Option<String>)>, StyleError> {
         let speeds = speeds(model, hip_height_m / style.hip_height_m);
         let knots = speeds.into_iter().map(|v| synthesize(model, population, metric, style, v, hip_height_m));
         let knots = knots.collect::<Result<Vec<Synthesis>, StyleError>>()?;
-        let mut notices: Vec<String> = knots.iter().filter_map(|s| s.notice.clone()).collect();
-        notices.dedup();
-        Ok(Gait::new(model, &knots, offsets).map(|gait| (gait, notices)))
+        let noticed = knots.iter().filter(|s| s.notice.is_some()).count();
+        let first = knots.iter().find_map(|s| s.notice.as_deref());
+        let notice = first.map(|n| format!("{noticed} of {} speeds of {}: {n}", knots.len(), model.activity));
+        Ok(Gait::new(model, &knots, offsets).map(|gait| (gait, notice)))
     }
 
     /// One speed only, with a little room to both sides; `None` for jumps.
@@ -203,7 +196,7 @@ impl Gait {
         }
     }
 
-    /// Places and weights B_k of (1); the control points go on straight beyond the ends.
+    /// Places and weights B_k of (1); the control points are mirrored at the ends, so the curve comes to rest there.
     fn speed_weights(&self, speed_m_s: f64) -> [(usize, f64); 4] {
         let last = self.cycles.len() - 1;
         let u = ((speed_m_s - self.slowest_m_s) / self.step_m_s).clamp(0.0, last as f64);
@@ -211,19 +204,9 @@ impl Gait {
         let t = u - i as f64;
         let (t2, t3) = (t * t, t * t * t);
         let b = [(1.0 - t).powi(3) / 6.0, (3.0 * t3 - 6.0 * t2 + 4.0) / 6.0, (3.0 * (t + t2 - t3) + 1.0) / 6.0, t3 / 6.0];
-        let mut found = [(i.saturating_sub(1), b[0]), (i, b[1]), (i + 1, b[2]), ((i + 2).min(last), b[3])];
-        if i == 0 {
-            // P_{−1} = 2 P_0 − P_1
-            found[0].1 = 0.0;
-            found[1].1 += 2.0 * b[0];
-            found[2].1 -= b[0];
-        }
-        if i + 1 == last {
-            found[3].1 = 0.0;
-            found[2].1 += 2.0 * b[3];
-            found[1].1 -= b[3];
-        }
-        found
+        let before = if i == 0 { 1 } else { i - 1 };
+        let after = if i + 1 == last { last - 1 } else { i + 2 };
+        [(before, b[0]), (i, b[1]), (i + 1, b[2]), (after, b[3])]
     }
 
     /// The whole cycle of weights over the speeds.
@@ -234,8 +217,7 @@ impl Gait {
     /// Straight legs under the hips, the slowest cycle's mean for the rest.
     fn standing(&self, offsets: &[Vector3<f64>; NODES]) -> [f64; CHANNELS] {
         let cycle = self.mix(&self.speed_weights(self.slowest_m_s));
-        let mut c: [f64; CHANNELS] =
-            std::array::from_fn(|i| cycle.iter().skip(i).step_by(CHANNELS).sum::<f64>() / SAMPLES as f64);
+        let mut c: [f64; CHANNELS] = std::array::from_fn(|i| cycle.iter().skip(i).step_by(CHANNELS).sum::<f64>() / SAMPLES as f64);
         let mut pose = self.pose_of(&c);
         for joint in LEG {
             pose.joints[joint as usize - 1] = UnitQuaternion::identity();

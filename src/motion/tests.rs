@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use nalgebra::Vector3;
 
 use super::gait::{Gait, aligning_phase};
-use super::player::{GRAVITY_M_S2, Gaits, Player};
+use super::player::{Eased, GRAVITY_M_S2, Gaits, Player};
 use super::{Profile, Waypoint, follow, plant_feet, play};
 use crate::body::{Clip, Joint, NODES, Pose, Shape};
 use crate::math::rotation::log;
@@ -154,8 +154,7 @@ fn the_speed_follows_the_profile_and_the_way_is_its_integral() {
         let s = steps.iter().min_by(|a, b| (a.time_s - time).abs().total_cmp(&(b.time_s - time).abs())).unwrap();
         assert!((s.speed_m_s - s.wanted_m_s).abs() < 0.02, "{time}: {} of {}", s.speed_m_s, s.wanted_m_s);
     }
-    let runs = |s: &super::Step| s.running == 1.0;
-    assert!(runs(&steps[750]) && steps[300].running == 0.0 && steps[1080].running == 0.0);
+    assert!(steps[750].running == 1.0 && steps[300].running == 0.0 && steps[1080].running == 0.0);
     // Half the step, the same pose: what is played does not depend on the frame rate.
     let finer = follow(&gaits, &outing(), &offsets(), 200.0).0;
     let (a, b) = (&clip.poses[700], &finer.poses[1400]);
@@ -196,10 +195,13 @@ fn the_running_cycle_is_shifted_to_where_its_legs_agree() {
         [Joint::LAnkle, Joint::RAnkle].map(|j| placed.position(j))
     };
     let apart = |shift: f64| -> f64 {
-        (0..50).map(|k| f64::from(k) / 50.0).map(|phase| {
-            let (a, b) = (ankles(&walk, phase), ankles(&run, phase + shift));
-            (a[0] - b[0]).norm_squared() + (a[1] - b[1]).norm_squared()
-        }).sum()
+        (0..50)
+            .map(|k| f64::from(k) / 50.0)
+            .map(|phase| {
+                let (a, b) = (ankles(&walk, phase), ankles(&run, phase + shift));
+                (a[0] - b[0]).norm_squared() + (a[1] - b[1]).norm_squared()
+            })
+            .sum()
     };
     let best = (-50..50).map(|k| f64::from(k) / 100.0).min_by(|a, b| apart(*a).total_cmp(&apart(*b))).unwrap();
     println!("shift {shift:.3}, by ankles {best:.2}");
@@ -222,7 +224,7 @@ fn a_bend_has_its_radius_and_the_lean_that_balances_it() {
         let area = 0.5 * (a.x * c.y - a.y * c.x);
         let found = a.norm() * b.norm() * c.norm() / (4.0 * area.abs());
         assert!((found / radius.abs() - 1.0).abs() < 0.02, "{found} of {radius}");
-        // Yaw is x towards... positive to the left, which is +x when going along +z.
+        // Left is +x for somebody who goes along +z.
         assert_eq!(p[2].x > 0.0, radius > 0.0);
         // Hips against feet over whole cycles, in the carrier and against straight on.
         let tilt = |curvature: f64| {
@@ -264,15 +266,23 @@ fn changes_are_mixed_in_smoothly_while_it_plays() {
     assert!((angle(&own, 1.0) / angle(&own, 0.0) - 2.0).abs() < 0.05);
     let gaits = Gaits::one(own);
     let mut player = Player::new(&gaits, 1.2, 0.0);
-    let poses: Vec<Pose> = (0..2000).map(|k| {
-        player.amounts[0].target = if k < 300 { 0.0 } else { 2.0 };
-        player.next(0.001)
-    }).collect();
+    let poses: Vec<Pose> = (0..2000)
+        .map(|k| {
+            player.amounts[0].target = if k < 300 { 0.0 } else { 2.0 };
+            player.next(0.001)
+        })
+        .collect();
     assert!((player.amounts[0].value() - 2.0).abs() < 0.01);
     let clip = Clip { fps: 1000.0, poses, offsets: offsets(), hip_height_m: hip_height_m() };
-    let plain = follow(&gaits, &Profile::steady(1.2, 0.0, 2.0).unwrap(), &offsets(), 1000.0).0;
-    let [with, without] = [roughness(&clip), roughness(&plain)];
-    assert!(with[1] < without[1] + 0.05, "no jump of velocity: {with:?} {without:?}");
+    let steady = |amount: f64| {
+        let mut player = Player::new(&gaits, 1.2, 0.0);
+        player.amounts[0] = Eased::at(amount);
+        let poses = (0..1000).map(|_| player.next(0.001)).collect();
+        roughness(&Clip { fps: 1000.0, poses, offsets: offsets(), hip_height_m: hip_height_m() })
+    };
+    let (mixed, lively) = (roughness(&clip), steady(2.0));
+    assert!(mixed[1] < 1.1 * lively[1] && mixed[3] < 1.1 * lively[3], "rougher than either: {mixed:?} {lively:?}");
+    assert!(lively[1] > 1.2 * steady(0.0)[1]);
 }
 
 /// Largest drift in m of a point of the sole while it touches (within 2 mm of the lowest), over one contact.
@@ -331,7 +341,10 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
         println!(
             "{name}: drift {:.1} -> {:.2} mm, change {standing:.1} deg standing, {elsewhere:.1} deg elsewhere, largest acceleration \
              {calm:.0} -> {shaken:.0} rad/s2, {} contacts, {} unreached",
-            1e3 * before, 1e3 * after, planted.contacts.iter().map(Vec::len).sum::<usize>(), planted.unreached
+            1e3 * before,
+            1e3 * after,
+            planted.contacts.iter().map(Vec::len).sum::<usize>(),
+            planted.unreached
         );
         assert!(after < 0.005 && after < 0.3 * before, "{before} {after}");
         assert!(elsewhere < 3.0 && others < 1e-6, "{elsewhere} {others}");
