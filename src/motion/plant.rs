@@ -4,8 +4,8 @@
 //! sole,
 //!   D' = −s,   mean of D over the contact = 0                                                                       (1)
 //! so the foot stays where it is on average and may still roll from heel to toe; the turn does the same for the foot's
-//! direction. Between contacts both go over from one to the next without jumps in value, rate or acceleration's end, a rate
-//! left over from a contact fading within [`RELEASE_S`]. The pelvis rises and sinks smoothly with the standing feet so that
+//! direction. Between contacts both go over from one to the next without jumps in value or rate, and a rate left over from a
+//! contact fades soon, so nothing pops. The pelvis rises and sinks smoothly with the standing feet so that
 //! legs keep their lengths; `two_bone` does the rest with a damped knee, which is let go outside the contacts.
 //!
 //! After Kovar, Schreiner and Gleicher (2002), "Footskate cleanup for motion capture editing", SCA. Departures: the sole
@@ -20,7 +20,7 @@ use nalgebra::Vector3;
 
 use super::contact::FootTrack;
 use super::two_bone::{LEGS, reach};
-use crate::body::{Clip, Joint};
+use crate::body::{Clip, Joint, Placement};
 use crate::math::rotation::exp;
 
 /// Standard deviation of the smoothing of the pelvis' height, seconds.
@@ -142,8 +142,8 @@ fn spread(frames: usize, contacts: &[Range<usize>], release: f64, held: impl Fn(
         before = Some((contact.end - 1, values[last], last_rate));
     }
     if let Some((from, value, rate)) = before {
-        for k in from + 1..frames {
-            found[k] = value + rate * (release * fade((k - from) as f64 / release));
+        for (k, rest) in found[from..].iter_mut().enumerate().skip(1) {
+            *rest = value + rate * (release * fade(k as f64 / release));
         }
     }
     found
@@ -151,21 +151,18 @@ fn spread(frames: usize, contacts: &[Range<usize>], release: f64, held: impl Fn(
 
 /// How far the pelvis goes up in every frame so that standing legs keep their length.
 fn pelvis_lift(clip: &Clip, targets: &[Vec<Vector3<f64>>; 2], contacts: &[Vec<Range<usize>>; 2]) -> Vec<f64> {
-    let frames = clip.poses.len();
-    let mut wanted = vec![None; frames];
-    for frame in 0..frames {
-        let placed = clip.place(&clip.poses[frame]);
-        let rises: Vec<f64> = (0..2)
-            .filter(|&side| stands(&contacts[side], frame))
-            .filter_map(|side| {
-                let [hip, _, ankle] = LEGS[side];
-                let kept = (placed.position(hip) - placed.position(ankle)).norm();
-                rise_to(&(placed.position(hip) - targets[side][frame]), kept)
-            })
-            .collect();
-        wanted[frame] = (!rises.is_empty()).then(|| rises.iter().sum::<f64>() / rises.len() as f64);
-    }
-    smooth(&filled(&wanted), PELVIS_S * clip.fps)
+    let rise = |frame: usize, side: usize, placed: &Placement| {
+        let [hip, _, ankle] = LEGS[side];
+        let kept = (placed.position(hip) - placed.position(ankle)).norm();
+        rise_to(&(placed.position(hip) - targets[side][frame]), kept)
+    };
+    let wanted = clip.poses.iter().enumerate().map(|(frame, pose)| {
+        let placed = clip.place(pose);
+        let standing = (0..2).filter(|&side| stands(&contacts[side], frame));
+        let rises: Vec<f64> = standing.filter_map(|side| rise(frame, side, &placed)).collect();
+        (!rises.is_empty()).then(|| rises.iter().sum::<f64>() / rises.len() as f64)
+    });
+    smooth(&filled(&wanted.collect::<Vec<_>>()), PELVIS_S * clip.fps)
 }
 
 /// Rise of the hip after which it is `long` from the target; the one that changes less.
@@ -191,13 +188,9 @@ fn filled(values: &[Option<f64>]) -> Vec<f64> {
 fn smooth(values: &[f64], sigma: f64) -> Vec<f64> {
     let reach = (3.0 * sigma).ceil() as usize;
     let average = |i: usize| {
-        let (from, to) = (i.saturating_sub(reach), (i + reach + 1).min(values.len()));
-        let (mut sum, mut weight) = (0.0, 0.0);
-        for k in from..to {
-            let w = (-0.5 * ((k as f64 - i as f64) / sigma).powi(2)).exp();
-            (sum, weight) = (sum + w * values[k], weight + w);
-        }
-        sum / weight
+        let near = i.saturating_sub(reach)..(i + reach + 1).min(values.len());
+        let weigh = |k: usize| (-0.5 * ((k as f64 - i as f64) / sigma).powi(2)).exp();
+        near.clone().map(|k| weigh(k) * values[k]).sum::<f64>() / near.map(weigh).sum::<f64>()
     };
     (0..values.len()).map(average).collect()
 }

@@ -110,6 +110,9 @@ mod tests {
         for case in 0..50 {
             let leg = LEGS[case % 2];
             let mut before = random_pose(&mut rng);
+            before.world_from_root = exp(&Vector3::new(0.1, case as f64, 0.05));
+            before.joints[Joint::Sacroiliac as usize - 1] = UnitQuaternion::identity();
+            before.joints[leg[0] as usize - 1] = exp(&Vector3::new(-0.3, 0.0, 0.05));
             before.joints[leg[1] as usize - 1] = exp(&Vector3::new(0.15, 0.0, 0.0));
             let placed = place(&offsets, &before);
             // 5 mm nearer and 10 mm to the side: the exact knee bends by degrees for that.
@@ -123,7 +126,7 @@ mod tests {
                 pose.joint(leg[1]).angle_to(before.joint(leg[1])).to_degrees()
             };
             let (exact, damped, kept) = (bend(0.0), bend(0.08), bend(f64::INFINITY));
-            assert!(exact > 2.0 && damped < 0.7 * exact && damped > 0.05 * exact && kept == 0.0, "{exact} {damped} {kept}");
+            assert!(exact > 2.0 && damped < 0.7 * exact && damped > 0.05 * exact && kept < 1e-5, "{exact} {damped} {kept}");
         }
     }
 
