@@ -152,7 +152,8 @@ mod tests {
         let clip = Clip { fps: 100.0, poses, offsets, hip_height_m: shape.hip_height_m() };
         let foot = FootTrack::new(&clip, Joint::RAnkle);
         assert!((foot.slide(50) - Vector3::new(0.0, 0.0, 5e-4)).norm() < 1e-12 && foot.turn(50) == 0.0);
-        assert_eq!(foot.contacts(&clip), [0..100]);
+        let contacts = foot.contacts(&clip);
+        assert!(contacts.len() == 1 && contacts[0] == (0..100), "{contacts:?}");
     }
 
     #[test]
