@@ -7,19 +7,21 @@ use clap::Args;
 use muybridge::body::{Clip, Shape};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
+use muybridge::io::outputs_json::Source;
 use muybridge::io::style_json::read_style;
-use muybridge::io::{bvh, is_motion_file, write_atomic};
+use muybridge::io::{is_motion_file, write_atomic};
 use muybridge::motion::player::ACCELERATION_M_S2;
 use muybridge::motion::{Gait, Gaits, Length, Profile, Step, Synthesis, follow, plant_feet, play, synthesize};
-use muybridge::motion_model::{Activity, Model};
+use muybridge::motion_model::{Activity, Cycle, Model};
 use muybridge::style::{Metric, Population, Style};
 
 use super::model::default_variance;
-use super::motions::read_recordings;
+use super::motions::{file_name, read_recordings};
+use super::outputs::{Made, OutputArgs};
 use super::profile;
 
 /// Fractions of stature at which the hip joints stand.
-const HIP_OF_STATURE: f64 = 0.53;
+pub const HIP_OF_STATURE: f64 = 0.53;
 /// People turn on a foot where a bend would be tighter.
 const TIGHTEST_M: f64 = 0.5;
 
@@ -80,6 +82,8 @@ pub struct GenerateArgs {
     /// Frames per second
     #[arg(long, default_value_t = 60.0, value_parser = super::positive)]
     fps: f64,
+    #[command(flatten)]
+    files: OutputArgs,
 }
 
 pub fn run(args: GenerateArgs) -> Result<()> {
@@ -101,6 +105,7 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -
     let (population, metric) = (population(args, model, style), metric(args));
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
+    let mut motions = Vec::new();
     for (value, name) in values.iter().zip(&names) {
         let synthesis = synthesize(model, &population, metric, style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
@@ -114,10 +119,13 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -
                 follow(&gaits, &Profile::steady(*value, radius_m.recip(), seconds)?, &shape.offsets(), args.fps).0
             }
         };
-        write(args, name, clip)?;
-        println!("{}: {:.3} cycles/s", args.output.join(name).display(), synthesis.frequency_hz);
+        let clip = planted(args, name, clip);
+        println!("{}: {} frames, {:.3} cycles/s", args.output.join(name).display(), clip.poses.len(), synthesis.frequency_hz);
         let _ = writeln!(table, "{}", table_row(name, model, &synthesis));
+        let stem = name.trim_end_matches(".bvh").to_string();
+        motions.push(Made { stem, value: *value, clip, frequency_hz: synthesis.frequency_hz });
     }
+    write_files(args, model, style, shape, &motions)?;
     write_atomic(&args.output.join("generated.csv"), table.as_bytes()).with_context(|| args.output.display().to_string())?;
     Ok(())
 }
@@ -140,10 +148,14 @@ fn along_profile(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shap
         );
     }
     let (clip, steps) = follow(&gaits, profile, &shape.offsets(), args.fps);
-    write(args, "profile.bvh", clip)?;
+    let clip = planted(args, "profile.bvh", clip);
+    let frames = clip.poses.len();
+    // A strip shows the whole way.
+    let made = Made { stem: "profile".into(), value: profile.mean_m_s(), clip, frequency_hz: 1.0 / profile.seconds() };
+    write_files(args, model, style, shape, &[made])?;
     write_atomic(&args.output.join("profile.csv"), steps_csv(&steps).as_bytes()).with_context(|| args.output.display().to_string())?;
     let off = steps.iter().map(|s| (s.speed_m_s - s.wanted_m_s).abs()).fold(0.0, f64::max);
-    println!("{}: {:.1} s, speed within {off:.2} m/s", args.output.join("profile.bvh").display(), profile.seconds());
+    println!("{}: {frames} frames, {:.1} s, speed within {off:.2} m/s", args.output.join("profile.bvh").display(), profile.seconds());
     Ok(())
 }
 
@@ -181,20 +193,22 @@ fn running(args: &GenerateArgs, path: &Path, shape: &Shape) -> Result<Gait> {
     Gait::typical(&model, &population, shape.hip_height_m(), &shape.offsets()).context("the speeds of running make no gait")
 }
 
-/// Writes a motion, its feet planted where that is wanted.
-fn write(args: &GenerateArgs, name: &str, mut clip: Clip) -> Result<()> {
-    if args.plant_feet {
-        let planted = plant_feet(&clip);
-        let contacts = planted.contacts.iter().map(Vec::len).sum::<usize>();
-        println!("{name}: {contacts} contacts of feet planted");
-        if planted.unreached > 0 {
-            eprintln!("notice: {name}: in {} frames a leg is too short to stay on its foot", planted.unreached);
-        }
-        clip = planted.clip;
+/// The motion with its feet planted where that is wanted.
+fn planted(args: &GenerateArgs, name: &str, clip: Clip) -> Clip {
+    if !args.plant_feet {
+        return clip;
     }
-    bvh::write_clip(&args.output.join(name), &clip, None)?;
-    println!("{}: {} frames", args.output.join(name).display(), clip.poses.len());
-    Ok(())
+    let planted = plant_feet(&clip);
+    println!("{name}: {} contacts of feet planted", planted.contacts.iter().map(Vec::len).sum::<usize>());
+    if planted.unreached > 0 {
+        eprintln!("notice: {name}: in {} frames a leg is too short to stay on its foot", planted.unreached);
+    }
+    planted.clip
+}
+
+fn write_files(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, motions: &[Made]) -> Result<()> {
+    let source = Source { motion: file_name(&args.style), model: file_name(&args.model), model_hash: model_hash(model) };
+    args.files.write(&args.output, shape, source, motions, &own_cycle(model, style))
 }
 
 fn metric(args: &GenerateArgs) -> Metric {
@@ -204,6 +218,10 @@ fn metric(args: &GenerateArgs) -> Metric {
 fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Population {
     let wanted = model.components(args.variance.unwrap_or(default_variance(model.activity)));
     Population::new(model, wanted.min(style.weights.len()))
+/// The person's motion as observed.
+fn own_cycle(model: &Model, style: &Style) -> Cycle {
+    let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(style.parameter, style.hip_height_m);
+    model.cycle(&style.weights, "", style.parameter, style.hip_height_m, 1.0 / frequency_hz)
 }
 
 fn table_row(name: &str, model: &Model, s: &Synthesis) -> String {

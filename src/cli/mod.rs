@@ -1,6 +1,7 @@
 //! One file per subcommand: load, call the library, save, report.
 mod animal;
 mod bench;
+mod blend;
 mod board;
 mod calibrate;
 mod check;
@@ -13,6 +14,7 @@ mod model;
 mod motions;
 mod observe;
 mod profile;
+mod outputs;
 mod progress;
 mod render;
 mod rig;
@@ -52,6 +54,9 @@ enum Command {
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
+    /// Motions in a vector space: mixed, with less or more of an attribute, caricatured, varied
+    #[command(subcommand)]
+    Blend(blend::BlendCommand),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
     /// From one video of an animal to its motion
@@ -93,6 +98,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
+        Command::Blend(command) => blend::run(command),
     }
 }
 

@@ -9,7 +9,9 @@ use muybridge::body::{Clip, NODES, Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::{self, Fit, FitOptions, Observation};
 use muybridge::footage::FrameSet;
-use muybridge::io::{bvh, fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::io::outputs_json::Source;
+use muybridge::io::{fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::math::euler::Order;
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom;
 use muybridge::report;
@@ -17,7 +19,8 @@ use muybridge::rig::{Rig, Up};
 use muybridge::style::Style;
 use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
 
-use super::motions::ActivityName;
+use super::motions::{ActivityName, file_name};
+use super::outputs::{Names, Writer};
 use super::{interrupt, observe};
 
 /// Frames in the strip of overlays.
@@ -33,7 +36,7 @@ pub struct TrackArgs {
     /// Which embedded model to use
     #[arg(long, default_value = "walking", conflicts_with = "model")]
     activity: ActivityName,
-    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, fit.json
+    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, motion.glb, joints.trc, joints.c3d, angles.mot, outputs.json, fit.json
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Frames per second of pictures
@@ -155,7 +158,10 @@ pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tra
     let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
     joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
     let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
-    bvh::write_clip(&folder.join("motion.bvh"), &clip, Some(&clip_from_rig))?;
+    let source = Source { motion: file_name(&session.folder), model: model.name.clone(), model_hash: model.hash.clone() };
+    let mut files = Writer::new(folder, fit.shape(), Some(clip_from_rig), Order::ZXY, source);
+    files.motion(&Names::tracked(), &model.model.activity.to_string(), &clip)?;
+    files.finish()?;
     style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
     let report = folder.join("fit.json");
     fit_json::write(&report, fit, observations, &model.name, &model.hash).with_context(|| report.display().to_string())

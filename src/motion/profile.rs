@@ -83,6 +83,11 @@ impl Profile {
         self.waypoints[self.waypoints.len() - 1].time_s
     }
 
+    pub fn mean_m_s(&self) -> f64 {
+        let way = |w: &[Waypoint]| 0.5 * (w[0].speed_m_s + w[1].speed_m_s) * (w[1].time_s - w[0].time_s);
+        self.waypoints.windows(2).map(way).sum::<f64>() / self.seconds()
+    }
+
     pub fn fastest_m_s(&self) -> f64 {
         self.waypoints.iter().map(|w| w.speed_m_s).fold(0.0, f64::max)
     }

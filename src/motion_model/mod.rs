@@ -3,6 +3,7 @@
 pub mod cadence;
 pub mod cycle;
 pub mod database;
+pub mod markers;
 pub mod model;
 pub mod segment;
 pub mod synthetic;

@@ -19,8 +19,10 @@ pub mod clusters;
 pub mod curves;
 pub mod figures;
 pub mod maps;
+pub mod marks;
 pub mod overlay;
 pub mod rig;
+pub mod strips;
 
 pub use calibration::calibration;
 pub use clouds::{CloudDot, cloud_and_body};
@@ -47,6 +49,11 @@ pub enum ReportError {
 pub fn save(path: &Path, picture: &RgbImage) -> Result<(), ReportError> {
     let png = png_bytes(path, &DynamicImage::from(picture.clone()))?;
     write_atomic(path, &png).map_err(|error| ReportError::Write { path: path.into(), error })
+}
+
+/// Writes a drawing as SVG.
+pub fn save_drawing(path: &Path, drawing: &marks::Drawing) -> Result<(), ReportError> {
+    write_atomic(path, drawing.svg().as_bytes()).map_err(|error| ReportError::Write { path: path.into(), error })
 }
 
 /// The PNG file that `path` is to be.
