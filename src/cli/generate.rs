@@ -218,6 +218,8 @@ fn metric(args: &GenerateArgs) -> Metric {
 fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Population {
     let wanted = model.components(args.variance.unwrap_or(default_variance(model.activity)));
     Population::new(model, wanted.min(style.weights.len()))
+}
+
 /// The person's motion as observed.
 fn own_cycle(model: &Model, style: &Style) -> Cycle {
     let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(style.parameter, style.hip_height_m);
