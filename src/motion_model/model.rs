@@ -45,7 +45,8 @@ impl Detail {
     /// Weighted sum; `None` of nothing.
     pub fn sum<'a>(parts: impl Iterator<Item = (&'a Detail, f64)>) -> Option<Detail> {
         parts.fold(None, |sum: Option<Detail>, (part, weight)| {
-            let mut sum = sum.unwrap_or_else(|| Detail { vector: DVector::zeros(part.vector.len()), root: DVector::zeros(part.root.len()) });
+            let mut sum =
+                sum.unwrap_or_else(|| Detail { vector: DVector::zeros(part.vector.len()), root: DVector::zeros(part.root.len()) });
             sum.vector.axpy(weight, &part.vector, 1.0);
             sum.root.axpy(weight, &part.root, 1.0);
             Some(sum)
@@ -177,12 +178,7 @@ impl Model {
     }
 
     /// [`Model::posture`] with what the weights do not hold.
-    pub fn posture_with(
-        &self,
-        weights: &[f64],
-        detail: Option<&Detail>,
-        phase: f64,
-    ) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
+    pub fn posture_with(&self, weights: &[f64], detail: Option<&Detail>, phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
         let (before, after, part) = neighbours(self.activity, phase);
         let at = |sample: usize| {
             let mut joints = combine_rows(&self.mean, &self.basis, weights, sample * DOF, DOF);
