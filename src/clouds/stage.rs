@@ -290,8 +290,7 @@ fn bridge(
     options: &StageOptions,
 ) -> GrayImage {
     let closed = regions::close(mask, BRIDGE_PX);
-    let before =
-        |d: f32, stage: f32| d - stage > clearance(rectification, stage, options.clearance_m).max(options.clearance_px);
+    let before = |d: f32, stage: f32| d - stage > clearance(rectification, stage, options.clearance_m).max(options.clearance_px);
     mask_of(region, |i| mask.as_raw()[i] != 0 || (closed.as_raw()[i] != 0 && before(disparity[i], stage[i])))
 }
 

@@ -126,8 +126,7 @@ pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed:
         let planes: Vec<f32> = per_pixel(&now, |i| plane_at(&now, width as usize, i));
         let look = |(k, other): (usize, &Other)| look_along(reference, &here[k], other, &planes, confirmed, 1 << k);
         let seen: Vec<Seen> = others.iter().enumerate().map(look).collect();
-        let found: Vec<Option<Fit>> =
-            (0..now.len()).into_par_iter().map(|i| fit_window(reference, &seen, &planes, &weights, i)).collect();
+        let found: Vec<Option<Fit>> = (0..now.len()).into_par_iter().map(|i| fit_window(reference, &seen, &planes, &weights, i)).collect();
         for (i, fit) in found.into_iter().enumerate() {
             if let Some(fit) = fit.filter(|f| f.step.abs() < LONGEST_STEP_PX) {
                 now[i] = planes[i] + fit.step;
