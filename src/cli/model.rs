@@ -11,7 +11,7 @@ use muybridge::motion_model::{Activity, Model, database, synthetic};
 use muybridge::report::validation::ValidationReport;
 use muybridge::style::validate::{Score, validate};
 
-use super::motions::{ActivityName, exclude, read_recordings};
+use super::motions::{ActivityName, TABLE, exclude, read_recordings};
 
 /// Components whose share of the variance is printed.
 const SHOWN_COMPONENTS: usize = 20;
@@ -33,7 +33,7 @@ pub enum ModelCommand {
 
 #[derive(Args)]
 pub struct BuildArgs {
-    /// Motion files (.bvh, .amc, .mot) or folders, searched to the bottom
+    /// Motion files (.bvh, .amc, .c3d, .trc, .mot) or folders, searched to the bottom
     #[arg(required = true, value_name = "MOCAP")]
     inputs: Vec<PathBuf>,
     /// Table of the files: file,subject,activity,speed_m_s or length_m,start_s,end_s
@@ -44,6 +44,9 @@ pub struct BuildArgs {
     exclude: Vec<String>,
     #[arg(long)]
     activity: ActivityName,
+    /// Table (CSV) of what was found in every file: cycles, speed, duration, and why anything was left out
+    #[arg(long, value_name = "FILE")]
+    table: Option<PathBuf>,
     /// Model file to write
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -91,6 +94,10 @@ fn build(args: BuildArgs) -> Result<()> {
     let activity = args.activity.into();
     let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
     let recordings = read_recordings(&entries, activity);
+    if let Some(path) = &args.table {
+        let text = format!("{TABLE}\n{}\n", recordings.table.join("\n"));
+        write_atomic(path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
+    }
     if recordings.cycles.is_empty() {
         bail!("none of {} motions can be used for {activity}{}", entries.len(), recordings.first_reason());
     }
