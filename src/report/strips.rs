@@ -11,7 +11,7 @@ use super::marks::{Drawing, Mark};
 use crate::body::{Clip, NODES};
 
 const PX_PER_M: f64 = 130.0;
-const LABEL_PX: f64 = 150.0;
+const LABEL_PX: f64 = 176.0;
 const HEAD_PX: f64 = 44.0;
 /// Of what was recorded.
 const UNDER: Colour = [150, 160, 175];
@@ -74,6 +74,7 @@ pub fn strips(rows: &[Strip], figures: usize) -> Result<Drawing, ReportError> {
     }
     let under = size[1] - 14.0;
     let cyclic = rows.iter().all(|r| r.cyclic);
+    marks.push(Mark::Text { at: [14.0, under], text: "phase".into(), capital_px: 9.0, colour: INK, align: Align::Left });
     for k in 0..figures {
         let at = [LABEL_PX + (k as f64 + 0.5) * place_px, under];
         let text = format!("{:.0} %", 100.0 * phase(k, figures, cyclic));
