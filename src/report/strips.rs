@@ -7,13 +7,14 @@ use image::RgbImage;
 use nalgebra::Vector3;
 
 use super::ReportError;
-use super::canvas::{Align, Canvas, GRID, INK, Pen, WHITE, legend, skeleton};
+use super::canvas::{Align, Canvas, GRID, INK, Pen, WHITE, legend, skeleton, text_width_px};
 use crate::body::{Clip, place};
 use crate::math::rotation::exp;
 
 const PX_PER_M: f64 = 105.0;
 const CELL_PX: u32 = 128;
-const LABEL_PX: u32 = 210;
+/// Least width of the labels' column.
+const LABEL_PX: u32 = 180;
 const TOP_PX: u32 = 44;
 const SCALE_PX: u32 = 34;
 /// Angle between the view and the walking direction, radians: 90 degrees would be the side.
@@ -36,12 +37,18 @@ pub fn strips(rows: &[Row], figures: usize) -> Result<RgbImage, ReportError> {
     let low_m = all().map(|p| p[1]).fold(0.0, f64::min);
     let row_px = ((top_m - low_m) * PX_PER_M) as u32 + 12;
     let height = TOP_PX + row_px * rows.len() as u32 + SCALE_PX;
-    let mut canvas = Canvas::new(LABEL_PX + CELL_PX * figures as u32 + 10, height, WHITE);
-    legend(&mut canvas, f64::from(LABEL_PX))?;
+    let mut left_px = LABEL_PX;
+    for row in rows {
+        left_px = left_px.max(text_width_px(&row.label, 11.0)?.ceil() as u32 + 30);
+    }
+    let left = f64::from(left_px);
+    let middle_px = |figure: usize| left + f64::from(CELL_PX) * (figure as f64 + 0.5);
+    let mut canvas = Canvas::new(left_px + CELL_PX * figures as u32 + 10, height, WHITE);
+    legend(&mut canvas, left)?;
     for (i, (row, drawn)) in rows.iter().zip(&drawn).enumerate() {
         let floor_px = f64::from(TOP_PX + row_px * (i as u32 + 1)) - 6.0 + low_m * PX_PER_M;
-        canvas.line([f64::from(LABEL_PX), floor_px], [f64::from(LABEL_PX + CELL_PX * figures as u32), floor_px], GRID, 2)?;
-        canvas.text([f64::from(LABEL_PX) - 16.0, floor_px - 0.5 * top_m * PX_PER_M], &row.label, 11.0, INK, Align::Right)?;
+        canvas.line([left, floor_px], [left + f64::from(CELL_PX) * figures as f64, floor_px], GRID, 2)?;
+        canvas.text([left - 16.0, floor_px - 0.5 * top_m * PX_PER_M], &row.label, 11.0, INK, Align::Right)?;
         for (k, figure) in drawn.iter().enumerate() {
             let middle = middle_px(k);
             let nodes = figure.map(|p| Some([middle + p[0] * PX_PER_M, floor_px - p[1] * PX_PER_M]));
@@ -50,15 +57,12 @@ pub fn strips(rows: &[Row], figures: usize) -> Result<RgbImage, ReportError> {
     }
     let last = if rows.iter().all(|r| r.cyclic) { figures } else { figures.max(2) - 1 };
     for k in 0..figures {
-        let at = format!("{:.2}", k as f64 / last as f64);
-        canvas.text([middle_px(k), f64::from(height) - 12.0], &at, 9.0, INK, Align::Centre)?;
+        let at = format!("{:.3}", k as f64 / last as f64);
+        let at = at.trim_end_matches('0').trim_end_matches('.');
+        canvas.text([middle_px(k), f64::from(height) - 12.0], at, 9.0, INK, Align::Centre)?;
     }
-    canvas.text([f64::from(LABEL_PX) - 16.0, f64::from(height) - 12.0], "part of the duration", 9.0, INK, Align::Right)?;
+    canvas.text([left - 16.0, f64::from(height) - 12.0], "part of the duration", 9.0, INK, Align::Right)?;
     Ok(canvas.picture)
-}
-
-fn middle_px(figure: usize) -> f64 {
-    f64::from(LABEL_PX) + f64::from(CELL_PX) * (figure as f64 + 0.5)
 }
 
 /// Nodes as (right, up) in metres from the floor below the root.
