@@ -27,6 +27,15 @@ pub fn stick_figures(clips: &[(String, &Clip)], figures: usize) -> Result<RgbIma
     Ok(canvas.picture)
 }
 
+/// Where a clip goes, or looks if it stays in place; horizontal.
+pub(super) fn forward(clip: &Clip) -> Vector3<f64> {
+    let (Some(first), Some(last)) = (clip.poses.first(), clip.poses.last()) else { return Vector3::z() };
+    let flat = |v: Vector3<f64>| Vector3::new(v.x, 0.0, v.z);
+    let travel = flat(last.root - first.root);
+    let forward = if travel.norm() > 0.3 { travel } else { flat(first.world_from_root * Vector3::z()) };
+    forward.try_normalize(1e-9).unwrap_or_else(Vector3::z)
+}
+
 /// Node positions as (forward, height) in metres from the clip's first root position.
 struct Row<'a> {
     label: &'a str,
@@ -39,11 +48,8 @@ struct Row<'a> {
 impl Row<'_> {
     fn new<'a>(label: &'a str, clip: &Clip, figures: usize) -> Row<'a> {
         let mut row = Row { label, figures: Vec::new(), from_m: 0.0, to_m: 0.0, top_m: 0.0 };
-        let (Some(first), Some(last)) = (clip.poses.first(), clip.poses.last()) else { return row };
-        let flat = |v: Vector3<f64>| Vector3::new(v.x, 0.0, v.z);
-        let travel = flat(last.root - first.root);
-        let forward = if travel.norm() > 0.3 { travel } else { flat(first.world_from_root * Vector3::z()) };
-        let forward = forward.try_normalize(1e-9).unwrap_or_else(Vector3::z);
+        let Some(first) = clip.poses.first() else { return row };
+        let forward = forward(clip);
         let count = figures.clamp(1, clip.poses.len());
         for i in 0..count {
             let pose = &clip.poses[i * (clip.poses.len() - 1) / (count - 1).max(1)];

@@ -1,121 +1,173 @@
-//! Strips: motions one below the other, each at the same instants, figure beside figure (figures 2 to 4 of Lim and Thalmann 2001).
+//! Strips of superposed stick figures, as in the style paper's Figures 3, 5, 6, 7, 9, 12 and 13: one row per speed or length,
+//! figures at even phases side by side, from the subject's right or its front right, walking to the right, what was recorded
+//! pale below what was made. Figures 2 to 4 of the vector-space paper are such strips too.
 //!
-//! Instants are equal parts of each motion's duration. The figures stand where the cell's middle is and are seen from the front
-//! right, so that both hands show.
+//! Every figure stands on the row's floor with its root at the middle of its place, so that rows compare posture against
+//! posture at the same phase, whatever the speed.
 
-use image::RgbImage;
 use nalgebra::Vector3;
 
 use super::ReportError;
-use super::canvas::{Align, Canvas, GRID, INK, Pen, WHITE, legend, skeleton, text_width_px};
-use crate::body::{Clip, place};
-use crate::math::rotation::exp;
+use super::canvas::{Align, Colour, GRID, INK, LEFT, Pen, RIGHT, skeleton_marks};
+use super::figures::forward;
+use super::marks::{Drawing, Mark};
+use crate::body::{Clip, NODES};
 
-const PX_PER_M: f64 = 105.0;
-const CELL_PX: u32 = 128;
-/// Least width of the labels' column.
-const LABEL_PX: u32 = 180;
-const TOP_PX: u32 = 44;
-const SCALE_PX: u32 = 34;
-/// Angle between the view and the walking direction, radians: 90 degrees would be the side.
-const VIEW: f64 = 0.9;
+const PX_PER_M: f64 = 130.0;
+const LABEL_PX: f64 = 200.0;
+const HEAD_PX: f64 = 44.0;
+/// Angle between the view and the walking direction, radians.
+pub const FROM_THE_SIDE: f64 = std::f64::consts::FRAC_PI_2;
+/// Both hands show.
+pub const FROM_THE_FRONT_RIGHT: f64 = 0.9;
+/// Of what was recorded.
+const UNDER: Colour = [150, 160, 175];
 
-/// One motion of a strip: its label and one cycle, or the whole of it.
-pub struct Row {
+/// A motion and the time that one cycle, or the whole jump, takes from its start.
+#[derive(Clone, Copy)]
+pub struct Phases<'a> {
+    pub clip: &'a Clip,
+    pub cycle_s: f64,
+}
+
+/// One row.
+pub struct Strip<'a> {
     pub label: String,
-    pub clip: Clip,
-    /// Open motions show their last instant too; a cycle's is its first.
+    pub made: Phases<'a>,
+    /// Drawn pale below.
+    pub recorded: Option<Phases<'a>>,
+    /// Gaits come round to phase 0, jumps end at phase 1.
     pub cyclic: bool,
 }
 
-/// All rows at `figures` instants, at one scale; the numbers below are parts of the duration.
-pub fn strips(rows: &[Row], figures: usize) -> Result<RgbImage, ReportError> {
-    let figures = figures.max(1);
-    let drawn: Vec<Vec<[[f64; 2]; crate::body::NODES]>> = rows.iter().map(|r| figures_of(r, figures)).collect();
-    let all = || drawn.iter().flatten().flatten();
-    let top_m = all().map(|p| p[1]).fold(1.0, f64::max) + 0.2;
-    let low_m = all().map(|p| p[1]).fold(0.0, f64::min);
-    let row_px = ((top_m - low_m) * PX_PER_M) as u32 + 12;
-    let height = TOP_PX + row_px * rows.len() as u32 + SCALE_PX;
-    let mut left_px = LABEL_PX;
-    for row in rows {
-        left_px = left_px.max(text_width_px(&row.label, 11.0)?.ceil() as u32 + 30);
-    }
-    let left = f64::from(left_px);
-    let middle_px = |figure: usize| left + f64::from(CELL_PX) * (figure as f64 + 0.5);
-    let mut canvas = Canvas::new(left_px + CELL_PX * figures as u32 + 10, height, WHITE);
-    legend(&mut canvas, left)?;
-    for (i, (row, drawn)) in rows.iter().zip(&drawn).enumerate() {
-        let floor_px = f64::from(TOP_PX + row_px * (i as u32 + 1)) - 6.0 + low_m * PX_PER_M;
-        canvas.line([left, floor_px], [left + f64::from(CELL_PX) * figures as f64, floor_px], GRID, 2)?;
-        canvas.text([left - 16.0, floor_px - 0.5 * top_m * PX_PER_M], &row.label, 11.0, INK, Align::Right)?;
-        for (k, figure) in drawn.iter().enumerate() {
-            let middle = middle_px(k);
-            let nodes = figure.map(|p| Some([middle + p[0] * PX_PER_M, floor_px - p[1] * PX_PER_M]));
-            skeleton(&mut canvas, &nodes, &Pen { width_px: 3, middle: INK, fade: 0.0, rim: None })?;
+/// Node positions as (right of the root as seen, height) in metres.
+type Figure = [[f64; 2]; NODES];
+
+/// The rows with `figures` instants each, seen at the angle `view`; y-up worlds.
+pub fn strips(rows: &[Strip], figures: usize, view: f64) -> Result<Drawing, ReportError> {
+    let figures = figures.max(2);
+    let all: Vec<(Vec<Figure>, Vec<Figure>)> = rows
+        .iter()
+        .map(|row| {
+            let made = instants(&row.made, figures, row.cyclic, view);
+            (made, row.recorded.map_or(Vec::new(), |recorded| instants(&recorded, figures, row.cyclic, view)))
+        })
+        .collect();
+    let points = || all.iter().flat_map(|(made, recorded)| made.iter().chain(recorded)).flatten();
+    let reach = points().map(|p| p[0].abs()).fold(0.3, f64::max);
+    // The head's circle stands above its joint.
+    let tall = points().map(|p| p[1]).fold(1.0, f64::max) + 0.17;
+    let place_px = 1.75 * reach * PX_PER_M;
+    let row_px = tall * PX_PER_M + 26.0;
+    let size = [LABEL_PX + figures as f64 * place_px + 20.0, HEAD_PX + rows.len() as f64 * row_px + 34.0];
+    let mut marks = legend(rows.iter().any(|r| r.recorded.is_some()));
+    for (i, (row, (made, recorded))) in rows.iter().zip(&all).enumerate() {
+        let floor_px = HEAD_PX + (i + 1) as f64 * row_px - 12.0;
+        marks.push(Mark::Line { from: [LABEL_PX, floor_px], to: [size[0] - 16.0, floor_px], colour: GRID, width_px: 2 });
+        let label =
+            Mark::Text { at: [14.0, floor_px - 0.5 * row_px], text: row.label.clone(), capital_px: 12.0, colour: INK, align: Align::Left };
+        marks.push(label);
+        let place = |figure: &Figure, k: usize| {
+            let middle = LABEL_PX + (k as f64 + 0.5) * place_px;
+            figure.map(|p| Some([middle + p[0] * PX_PER_M, floor_px - p[1] * PX_PER_M]))
+        };
+        let made_pen = Pen { width_px: 2, middle: INK, fade: 0.0, rim: None };
+        for (k, figure) in recorded.iter().enumerate() {
+            let mut pale = skeleton_marks(&place(figure, k), &Pen { width_px: 6, middle: UNDER, fade: 0.35, rim: None });
+            pale.iter_mut().for_each(|mark| tint(mark, UNDER));
+            marks.extend(pale);
         }
+        marks.extend(made.iter().enumerate().flat_map(|(k, figure)| skeleton_marks(&place(figure, k), &made_pen)));
     }
-    let last = if rows.iter().all(|r| r.cyclic) { figures } else { figures.max(2) - 1 };
+    let under = size[1] - 14.0;
+    let cyclic = rows.iter().all(|r| r.cyclic);
     for k in 0..figures {
-        let at = format!("{:.3}", k as f64 / last as f64);
-        let at = at.trim_end_matches('0').trim_end_matches('.');
-        canvas.text([middle_px(k), f64::from(height) - 12.0], at, 9.0, INK, Align::Centre)?;
+        let at = [LABEL_PX + (k as f64 + 0.5) * place_px, under];
+        let text = format!("{:.0} %", 100.0 * phase(k, figures, cyclic));
+        marks.push(Mark::Text { at, text, capital_px: 9.0, colour: INK, align: Align::Centre });
     }
-    canvas.text([left - 16.0, f64::from(height) - 12.0], "part of the duration", 9.0, INK, Align::Right)?;
-    Ok(canvas.picture)
+    Ok(Drawing { size_px: size.map(|s| s.ceil() as u32), marks })
 }
 
-/// Nodes as (right, up) in metres from the floor below the root.
-fn figures_of(row: &Row, figures: usize) -> Vec<[[f64; 2]; crate::body::NODES]> {
-    let poses = &row.clip.poses;
-    let (Some(last), Some(first)) = (poses.len().checked_sub(1), poses.first()) else { return Vec::new() };
-    let facing = first.world_from_root * Vector3::z();
-    let right_in_view = exp(&Vector3::new(0.0, facing.x.atan2(facing.z), 0.0)) * Vector3::new(VIEW.cos(), 0.0, VIEW.sin());
-    let steps = if row.cyclic { figures } else { figures.max(2) - 1 };
-    (0..figures)
-        .map(|k| {
-            let at = (k * last) as f64 / steps as f64;
-            let pose = poses[at as usize].towards(&poses[(at as usize + 1).min(last)], at.fract());
-            place(&row.clip.offsets, &pose).positions.map(|x| [(x - pose.root).dot(&right_in_view), x.y])
-        })
-        .collect()
+/// Instants of a gait share its cycle out, those of a jump include both ends.
+fn phase(k: usize, figures: usize, cyclic: bool) -> f64 {
+    k as f64 / if cyclic { figures } else { figures - 1 } as f64
+}
+
+fn tint(mark: &mut Mark, with: Colour) {
+    if let Mark::Line { colour, .. } | Mark::Disc { colour, .. } | Mark::Circle { colour, .. } = mark {
+        *colour = super::canvas::faded(with, 0.35);
+    }
+}
+
+fn instants(motion: &Phases, figures: usize, cyclic: bool, view: f64) -> Vec<Figure> {
+    let Phases { clip, cycle_s } = motion;
+    let forward = forward(clip);
+    let right_in_view = forward * view.sin() + Vector3::y().cross(&forward) * view.cos();
+    let at = |k: usize| {
+        let frame = (phase(k, figures, cyclic) * cycle_s * clip.fps).clamp(0.0, clip.poses.len().saturating_sub(1) as f64);
+        let before = clip.poses.get(frame as usize)?;
+        let after = clip.poses.get(frame as usize + 1).unwrap_or(before);
+        let placed = clip.place(&before.towards(after, frame.fract()));
+        let root = placed.positions[0];
+        Some(placed.positions.map(|x| [(x - root).dot(&right_in_view), x.y]))
+    };
+    (0..figures).filter_map(at).collect()
+}
+
+fn legend(recorded: bool) -> Vec<Mark> {
+    let mut entries = vec![("left", LEFT, 3), ("right", RIGHT, 3)];
+    if recorded {
+        entries.push(("recorded", super::canvas::faded(UNDER, 0.35), 6));
+    }
+    let entry = |(k, (name, colour, width_px)): (usize, (&str, Colour, i32))| {
+        let x = LABEL_PX + 120.0 * k as f64;
+        [
+            Mark::Line { from: [x, 22.0], to: [x + 28.0, 22.0], colour, width_px },
+            Mark::Text { at: [x + 36.0, 27.0], text: name.into(), capital_px: 10.0, colour: INK, align: Align::Left },
+        ]
+    };
+    entries.into_iter().enumerate().flat_map(entry).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::body::{Joint, Pose, Shape};
-    use crate::report::canvas::{LEFT, RIGHT};
+    use crate::body::{Joint, Shape};
+    use crate::motion::{Length, play_cycle};
+    use crate::motion_model::{Activity, synthetic};
+
+    fn walk(speed_m_s: f64) -> (Clip, f64) {
+        let cycle = synthetic::subject(Activity::Walking, 3).cycle(speed_m_s, 0);
+        (play_cycle(&cycle, &Shape::template(1.7).offsets(), 120.0, Length::Cycles(1)), cycle.duration_s)
+    }
 
     #[test]
-    fn every_row_and_instant_has_its_figure_on_the_floor() {
-        let shape = Shape::template(1.7);
-        let offsets = shape.offsets();
-        let poses = (0..41).map(|k| {
-            let mut pose = Pose::rest(offsets[0] + Vector3::new(0.0, 0.0, 0.05 * k as f64));
-            // The right arm rises to the side from down to level.
-            pose.joints[Joint::RShoulder as usize - 1] = exp(&Vector3::new(0.0, 0.0, -0.0393 * k as f64));
-            pose
-        });
-        let clip = Clip { fps: 40.0, poses: poses.collect(), offsets, hip_height_m: shape.hip_height_m() };
-        let row = |label: &str| Row { label: label.into(), clip: clip.clone(), cyclic: false };
-        let picture = strips(&[row("mean"), row("again")], 5).unwrap();
-        let row_px = (picture.height() - TOP_PX - SCALE_PX) / 2;
-        // Topmost pixel of the right arm's colour in a cell: it rises from instant to instant, in both rows alike.
-        let top = |row: u32, cell: u32| {
-            let hand = |x: u32, y: u32| {
-                let p = picture.get_pixel(x, y).0;
-                p.iter().zip(RIGHT).all(|(a, b)| a.abs_diff(b) < 30)
+    fn figures_stand_at_even_phases_over_the_recording() {
+        let [(slow, slow_s), (fast, fast_s)] = [1.0, 1.7].map(walk);
+        let [made, recorded] = [Phases { clip: &fast, cycle_s: fast_s }, Phases { clip: &slow, cycle_s: slow_s }];
+        let rows = [
+            Strip { label: "1.70 m/s".into(), made, recorded: Some(made), cyclic: true },
+            Strip { label: "1.00 m/s".into(), made: recorded, recorded: None, cyclic: true },
+        ];
+        let drawing = strips(&rows, 8, FROM_THE_SIDE).unwrap();
+        // The recording is the motion itself: every bone lies on a pale one, eight figures of 26 bones in each of the three.
+        let lines = |width: i32| -> Vec<([f64; 2], [f64; 2])> {
+            let bone = |mark: &Mark| match mark {
+                Mark::Line { from, to, width_px, colour } if *width_px == width && *colour != GRID => Some((*from, *to)),
+                _ => None,
             };
-            let x = LABEL_PX + cell * CELL_PX..LABEL_PX + (cell + 1) * CELL_PX;
-            x.filter_map(|x| (TOP_PX + row * row_px..TOP_PX + (row + 1) * row_px).find(|&y| hand(x, y)).map(|y| (x, y - row * row_px)))
-                .min()
-                .unwrap()
+            drawing.marks.iter().filter_map(bone).filter(|(from, _)| from[1] > HEAD_PX).collect()
         };
-        let outermost: Vec<u32> = (0..5).map(|cell| top(0, cell).1).collect();
-        assert!(outermost.windows(2).all(|w| w[1] <= w[0]) && outermost[4] + 40 < outermost[0], "{outermost:?}");
-        assert_eq!(outermost, (0..5).map(|cell| top(1, cell).1).collect::<Vec<_>>());
-        assert!(picture.pixels().any(|p| p.0 == LEFT));
-        assert!(strips(&[], 5).is_ok());
+        let (pale, strong) = (lines(6), lines(2));
+        assert_eq!((pale.len(), strong.len()), (8 * 26, 2 * 8 * 26));
+        assert_eq!(pale[..], strong[..8 * 26]);
+        // The left heel strikes half a cycle after the right one: at phase 0 the right ankle leads, at 4/8 the left.
+        let ahead = |k: usize, joint: Joint| instants(&made, 8, true, FROM_THE_SIDE)[k][joint as usize][0];
+        assert!(ahead(0, Joint::RAnkle) > 0.2 && ahead(4, Joint::LAnkle) > 0.2 && ahead(0, Joint::LAnkle) < -0.2);
+        let picture = drawing.picture().unwrap();
+        assert_eq!([picture.width(), picture.height()], drawing.size_px);
+        assert!(drawing.svg().contains(">1.70 m/s</text>") && drawing.svg().contains(">88 %</text>"));
+        assert!(strips(&[], 5, FROM_THE_SIDE).unwrap().picture().is_ok());
     }
 }

@@ -13,7 +13,7 @@ use muybridge::io::manifest::{Entry, find_motions};
 use muybridge::io::{bvh, is_motion_file, read_clip, write_atomic};
 use muybridge::motion_model::Activity;
 use muybridge::report;
-use muybridge::report::strips::{Row, strips};
+use muybridge::report::strips::{FROM_THE_FRONT_RIGHT, Phases, Strip, strips};
 use muybridge::style::space::{Example, Space, Vectors, measure};
 
 use super::generate::HIP_OF_STATURE;
@@ -109,13 +109,18 @@ impl OutputArgs {
 /// One cycle, or the whole, of every motion.
 fn save_strip(path: &Path, space: &Space, motions: &[Made]) -> Result<()> {
     let shape = Shape::template(space.hip_height_m() / HIP_OF_STATURE);
-    let row = |m: &Made| {
+    // Whole frames at both ends, fine enough for any instant.
+    let play = |m: &Made| {
         let blend = space.play(&m.vectors);
-        // Whole frames at both ends, fine enough for any instant.
-        let fps = 100.0 / blend.duration_s();
-        Row { label: m.label.clone(), clip: blend.clip(&shape.offsets(), shape.hip_height_m(), fps, 1), cyclic: blend.is_cyclic() }
+        (blend.clip(&shape.offsets(), shape.hip_height_m(), 100.0 / blend.duration_s(), 1), blend)
     };
-    let picture = strips(&motions.iter().map(row).collect::<Vec<_>>(), FIGURES)?;
+    let played: Vec<_> = motions.iter().map(play).collect();
+    let mut rows = Vec::new();
+    for (m, (clip, blend)) in motions.iter().zip(&played) {
+        let made = Phases { clip, cycle_s: blend.duration_s() };
+        rows.push(Strip { label: m.label.clone(), made, recorded: None, cyclic: blend.is_cyclic() });
+    }
+    let picture = strips(&rows, FIGURES, FROM_THE_FRONT_RIGHT)?.picture()?;
     Ok(report::save(path, &picture)?)
 }
 
