@@ -279,7 +279,7 @@ fn what_cannot_be_done_is_said_in_one_sentence() {
         (&["build", &w1, &w2, "--reference", "w7", "-o", &out], "no motion `w7`"),
         (&["mix", &space, "--shape", "w1=1,nobody=1", "-o", &out], "no motion `nobody`; it has w1#1"),
         (&["mix", &space, "--shape", "w1=1,w2=-1", "-o", &out], "add up to"),
-        (&["attribute", &space, "grace", "-o", &out], "no attribute `grace`; it has right-hand-height, energy"),
+        (&["attribute", &space, "grace", "-o", &out], "no attribute `grace`; it has hand-height, energy"),
         (&["attribute", &space, "energy", "--by", "1,1", "-o", &out], "+1 is asked for twice"),
         (&["caricature", &space, "--of", &at("none.bvh"), "-o", &out], "none.bvh"),
         (&["info", &w1], "no space of motions"),

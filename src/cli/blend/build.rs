@@ -40,7 +40,7 @@ pub struct BuildArgs {
     /// Motion files (.bvh, .amc, .mot) or folders, searched to the bottom
     #[arg(required = true, value_name = "MOTIONS")]
     inputs: Vec<PathBuf>,
-    /// Table of attributes: a column `file`, the others numbers; right-hand-height and energy are measured without it
+    /// Table of attributes: a column `file`, the others numbers; hand-height (the right one) and energy are measured without it
     #[arg(long, value_name = "FILE")]
     labels: Option<PathBuf>,
     /// Table of the files: file,subject,activity,speed_m_s or length_m,start_s,end_s
