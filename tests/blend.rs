@@ -10,7 +10,7 @@ use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, Cycle, Label, SAMPLES, segment};
 use muybridge::style::space::attributes::{direction, spread};
 use muybridge::style::space::measure::measure;
-use muybridge::style::space::{Blend, Example, Method, Options, Posture, Space, manipulate};
+use muybridge::style::space::{Blend, Example, Live, Method, Options, Posture, Space, Vectors, manipulate};
 use nalgebra::Vector3;
 
 fn mocap(folder: &str) -> Option<PathBuf> {
@@ -150,12 +150,26 @@ fn attributes_of_stylised_walks_move_alone_and_caricatures_move_away() {
         space.members.iter().zip(&examples).for_each(|(member, example)| round_trip(&space.play(&member.vectors), example));
         (0..2).for_each(|attribute| moves_alone(&space, attribute));
         let own = &space.members[space.members_called(own).unwrap()[0]].vectors;
+        print_cost(&space, own);
         let mean = space.play(&space.mean());
         let distances = [0.0, 0.5, 1.0, 1.5, 2.0]
             .map(|degree| posture_distance_deg(&space.play(&manipulate::caricature(&space.mean(), own, degree, degree)), &mean));
         println!("caricatures of degree 0, 0.5, ..., 2: {distances:.1?} degrees from the mean");
         assert!(distances.windows(2).all(|w| w[1] > w[0] + 1.0), "{distances:?}");
     }
+}
+
+/// What a knob and a posture cost live; neither looks at the examples.
+fn print_cost(space: &Space, own: &Vectors) {
+    let mut live = Live::new(space, own, &[0, 1]).unwrap();
+    let start = std::time::Instant::now();
+    (0..200).for_each(|k| live.set(&[1e-4 * f64::from(k), 0.0], 1.2));
+    let set_us = start.elapsed().as_secs_f64() / 200.0 * 1e6;
+    let start = std::time::Instant::now();
+    let turned = (0..20_000).filter(|_| live.next(0.01).0[2].angle() > 0.2).count();
+    let next_us = start.elapsed().as_secs_f64() / 20_000.0 * 1e6;
+    assert!((1..20_000).contains(&turned), "it moves");
+    println!("live, {} examples: {set_us:.0} us to turn a knob, {next_us:.2} us a posture", space.members.len());
 }
 
 /// Five steps of one measured attribute, the other within a standard deviation of the examples'.

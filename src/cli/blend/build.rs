@@ -37,7 +37,7 @@ enum Timing {
 
 #[derive(Args)]
 pub struct BuildArgs {
-    /// Motion files (.bvh, .amc, .mot) or folders, searched to the bottom
+    /// Motion files (.bvh, .amc, .mot, .c3d, .trc) or folders, searched to the bottom
     #[arg(required = true, value_name = "MOTIONS")]
     inputs: Vec<PathBuf>,
     /// Table of attributes: a column `file`, the others numbers; hand-height (the right one) and energy are measured without it
