@@ -2,6 +2,7 @@
 mod animal;
 mod batch;
 mod bench;
+mod blend;
 mod board;
 mod calibrate;
 mod check;
@@ -13,10 +14,12 @@ mod interrupt;
 mod model;
 mod motions;
 mod observe;
+mod outputs;
 mod progress;
 mod render;
 mod rig;
 mod track;
+mod track_report;
 mod whole;
 
 use anyhow::Result;
@@ -52,6 +55,9 @@ enum Command {
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
+    /// Motions in a vector space: mixed, with less or more of an attribute, caricatured, varied
+    #[command(subcommand)]
+    Blend(blend::BlendCommand),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
     /// Every session of a study, whatever breaks on the way; results that are there already are kept
@@ -96,6 +102,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
+        Command::Blend(command) => blend::run(command),
     }
 }
 

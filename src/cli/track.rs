@@ -9,17 +9,20 @@ use muybridge::body::{Clip, NODES, Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::{self, Checkpoints, Fit, FitOptions, Observation};
 use muybridge::footage::FrameSet;
+use muybridge::io::outputs_json::Source;
 use muybridge::io::session_config::{self, DEFAULT_ACTIVITY, SessionConfig};
-use muybridge::io::{bvh, content, fit_checkpoint, fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::io::{content, fit_checkpoint, fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::math::euler::Order;
 use muybridge::motion_model::{Activity, Model, synthetic};
-use muybridge::phantom;
-use muybridge::report;
+use muybridge::phantom::{self, DepthMap};
+use muybridge::report::{self, track::UNDECIDED, walk::BAND};
 use muybridge::rig::{Rig, Up};
 use muybridge::style::Style;
 use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
 
 use super::motions::{ActivityName, file_name};
-use super::{interrupt, observe};
+use super::outputs::{Names, Writer};
+use super::{interrupt, observe, track_report};
 
 /// Frames in the strip of overlays.
 const STRIP: usize = 6;
@@ -34,7 +37,7 @@ pub struct TrackArgs {
     /// Which embedded model to use; walking without it
     #[arg(long, conflicts_with = "model")]
     activity: Option<ActivityName>,
-    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, fit.json
+    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, motion.glb, joints.trc, joints.c3d, angles.mot, outputs.json, fit.json
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Folder that keeps what is found frame by frame, so that a run that was stopped goes on from there
@@ -49,6 +52,9 @@ pub struct TrackArgs {
     /// Also draw the result into DIR/pictures
     #[arg(long)]
     pictures: bool,
+    /// Leave out report.html, thumbnail.jpg, gait.csv and angles_cycle.csv
+    #[arg(long)]
+    no_report: bool,
 }
 
 /// A model with what the outputs say of it.
@@ -77,6 +83,8 @@ pub struct Tracked {
     pub observations: Vec<Observation>,
     /// The pictures of all cameras for each frame of the strips: index of the frame, pictures.
     pub pictures: Vec<(usize, Vec<GrayImage>)>,
+    /// Number of the middle frame, and the person's depths there in the reference view, metres; NaN where unknown.
+    pub depth: Option<(usize, DepthMap)>,
 }
 
 impl TrackArgs {
@@ -119,6 +127,9 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     let kept = args.work.as_ref().map(|work| kept_folder(work, "fit", &session, &format!("{} {options:?} {}", model.hash, session.fps)));
     let tracked = fit_to(&session, seen, &model, &options, kept.transpose()?.as_deref())?;
     write(&args.output, &session, &model, &tracked)?;
+    if !args.no_report {
+        track_report::write(&args.output, &session, &model, &tracked)?;
+    }
     if config.pictures == Some(true) {
         draw(&args.output.join("pictures"), &session.rig, &model, &tracked)?;
     }
@@ -130,6 +141,7 @@ pub fn run(args: &TrackArgs) -> Result<()> {
 pub struct Seen {
     observations: Vec<Observation>,
     pictures: Vec<(usize, Vec<GrayImage>)>,
+    depth: Option<(usize, DepthMap)>,
     floor_m: Option<f64>,
 }
 
@@ -141,15 +153,26 @@ pub fn look(session: &Session, work: Option<&Path>, mut each: impl FnMut(&CloudR
     let rig =
         CloudRig::new(&session.rig, Some(&stage), &cloud_options).with_context(|| format!("the rig of {}", session.folder.display()))?;
     let step = session.frame_count.div_ceil(STRIP).max(1);
-    let (mut pictures, mut index) = (Vec::new(), 0);
+    let (mut pictures, mut depth, mut index) = (Vec::new(), None, 0);
     let observations = observe::observe(session, &rig, &cloud_options, kept.as_deref(), |frame, found| {
         if index % step == 0 {
             pictures.push((index, frame.images.clone()));
         }
+        if index == session.frame_count / 2 {
+            depth = depth_of(&rig, found).map(|map| (frame.number, map));
+        }
         index += 1;
         each(&rig, frame, found)
     })?;
-    Ok(Seen { observations, pictures, floor_m: rig.floor_m(&session.rig.up.direction()) })
+    Ok(Seen { observations, pictures, depth, floor_m: rig.floor_m(&session.rig.up.direction()) })
+}
+
+/// Depths in the reference view, metres.
+fn depth_of(rig: &CloudRig, found: &FrameCloud) -> Option<DepthMap> {
+    let (rectification, _) = rig.groups.first()?;
+    let mut map = found.disparity.clone();
+    map.pixels_mut().for_each(|d| d.0[0] = if d.0[0] > 0.0 { rectification.depth(d.0[0].into()) as f32 } else { f32::NAN });
+    Some(map)
 }
 
 /// The folder below `work` for what this program finds in this footage with these options.
@@ -160,7 +183,7 @@ fn kept_folder(work: &Path, kind: &str, session: &Session, options: &str) -> Res
 
 /// The fit to what was seen of a session; in the folder `kept` its state is kept after every iteration.
 pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions, kept: Option<&Path>) -> Result<Tracked> {
-    let Seen { observations, pictures, floor_m } = seen;
+    let Seen { observations, pictures, depth, floor_m } = seen;
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
     let checkpoints = Checkpoints {
@@ -177,7 +200,7 @@ pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOp
     })
     .with_context(|| session.folder.display().to_string())?;
     bar.finish();
-    Ok(Tracked { fit, observations, pictures })
+    Ok(Tracked { fit, observations, pictures, depth })
 }
 
 /// Writes the files of a tracked session.
@@ -190,7 +213,10 @@ pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tra
     let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
     joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
     let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
-    bvh::write_clip(&folder.join("motion.bvh"), &clip, Some(&clip_from_rig))?;
+    let source = Source { motion: file_name(&session.folder), model: model.name.clone(), model_hash: model.hash.clone() };
+    let mut files = Writer::new(folder, fit.shape(), Some(clip_from_rig), Order::ZXY, source);
+    files.motion(&Names::tracked(), &model.model.activity.to_string(), &clip)?;
+    files.finish()?;
     style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
     let report = folder.join("fit.json");
     fit_json::write(&report, fit, observations, &model.name, &model.hash).with_context(|| report.display().to_string())
@@ -213,7 +239,7 @@ pub fn style(fit: &Fit, model: &NamedModel) -> Style {
 }
 
 /// The fitted poses in a y-up world, one per 1/fps second, dropped frames filled in; and the rotation into that world.
-fn clip(fit: &Fit, rig: &Rig, observations: &[Observation], fps: f64) -> Result<(Clip, Rotation3<f64>)> {
+pub(super) fn clip(fit: &Fit, rig: &Rig, observations: &[Observation], fps: f64) -> Result<(Clip, Rotation3<f64>)> {
     ensure!(!fit.poses.is_empty(), "the fit has no frames");
     let clip_from_rig = match rig.up {
         Up::Y => Rotation3::identity(),
@@ -233,7 +259,7 @@ fn clip(fit: &Fit, rig: &Rig, observations: &[Observation], fps: f64) -> Result<
 /// Overlays for each camera, the cloud with the body of the middle frame, curves of phase and root, and the weights among
 /// the model's.
 pub fn draw(folder: &Path, rig: &Rig, model: &NamedModel, tracked: &Tracked) -> Result<()> {
-    let Tracked { fit, observations, pictures } = tracked;
+    let Tracked { fit, observations, pictures, .. } = tracked;
     let placements = placements(fit);
     let (surface, offsets) = (muybridge::body::Surface::new(fit.shape()), fit.shape().offsets());
     for (k, camera) in rig.cameras.iter().enumerate() {
@@ -260,9 +286,6 @@ pub fn draw(folder: &Path, rig: &Rig, model: &NamedModel, tracked: &Tracked) -> 
     Ok(report::save(&folder.join("weights.png"), &picture)?)
 }
 
-/// Two standard deviations either way of a normal hold 95 %.
-const BAND: f64 = 1.96;
-
 /// Phase, and root position and heading, over time with bands of 95 %.
 fn draw_curves(folder: &Path, tracked: &Tracked) -> Result<()> {
     let Tracked { fit, observations, .. } = tracked;
@@ -282,13 +305,10 @@ fn draw_curves(folder: &Path, tracked: &Tracked) -> Result<()> {
     Ok(report::save(&folder.join("root.png"), &picture)?)
 }
 
-/// Costs of the two half-cycle hypotheses closer than this leave open which leg is which.
-const UNDECIDED: f64 = 1.3;
-
 fn summary(folder: &Path, fit: &Fit) {
     if fit.hypotheses[1] < UNDECIDED * fit.hypotheses[0] {
         eprintln!(
-            "warning: with left and right legs exchanged the cost is {:.0} against {:.0}; look at the pictures (--pictures) before you trust the sides",
+            "warning: with left and right legs exchanged the cost is {:.0} against {:.0}; look at the report before you trust the sides",
             fit.hypotheses[1], fit.hypotheses[0]
         );
     }

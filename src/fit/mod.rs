@@ -14,6 +14,7 @@ pub mod state;
 pub mod targets;
 pub mod uncertainty;
 pub mod weighing;
+pub mod whole_cycle;
 mod wrench;
 
 use std::sync::Arc;

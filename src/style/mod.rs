@@ -6,6 +6,7 @@
 pub mod curves;
 pub mod distance;
 pub mod extrapolate;
+pub mod space;
 pub mod validate;
 
 pub use curves::Population;
