@@ -3,7 +3,7 @@
 
     python3 benches/batch.py target/release/muybridge /tmp/batch-bench [--sessions 60] [--kills 20] [--counts 10,50,200] [--slurm]
 
-Prints one line per figure. The footage is the phantom's: 10 frames of 160x120 px per session. Takes about twenty minutes on
+Prints one line per figure. The footage is the phantom's: 6 frames of 160x120 px per session. Takes about twenty minutes on
 two idle cores; other load makes the figures of cores and seconds worse.
 """
 import argparse, hashlib, os, random, resource, shutil, subprocess, sys, time
@@ -18,7 +18,7 @@ parser.add_argument("--slurm", action="store_true")
 args = parser.parse_args()
 PROGRAM, PLACE = os.path.abspath(args.muybridge), os.path.abspath(args.place)
 RIG = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "calib", "phantom_lab.toml")
-FRAMES = 10
+FRAMES = 6
 
 
 def run(*arguments, check=True):
