@@ -15,7 +15,7 @@ use muybridge::report::generated::{GeneratedReport, Made};
 use muybridge::style::{Metric, Population, Style};
 
 use super::model::default_variance;
-use super::motions::read_recordings;
+use super::motions::{file_name, read_recordings};
 
 /// Fractions of stature at which the hip joints stand.
 const HIP_OF_STATURE: f64 = 0.53;
@@ -92,9 +92,9 @@ fn report(args: &GenerateArgs, model: &Model, style: &Style, names: &[String], m
     let made = names.iter().zip(made).map(|(file, (synthesis, clip))| Made { file, synthesis, clip }).collect();
     let page = GeneratedReport {
         model,
-        model_name: &args.model.display().to_string(),
+        model_name: &file_name(&args.model),
         style,
-        style_name: &args.style.display().to_string(),
+        style_name: &file_name(&args.style),
         made,
         options: &[
             ("weighing", if args.mahalanobis { "Mahalanobis" } else { "the paper's" }.to_string()),
