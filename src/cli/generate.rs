@@ -165,9 +165,9 @@ fn method_words(method: Method) -> &'static str {
 fn report(args: &GenerateArgs, model: &Model, style: &Style, made: Vec<generated::Made>) -> Result<()> {
     let page = GeneratedReport {
         model,
-        model_name: &args.model.display().to_string(),
+        model_name: &file_name(&args.model),
         style,
-        style_name: &args.style.display().to_string(),
+        style_name: &file_name(&args.style),
         made,
         options: &[("method", method_words(method(args)?).to_string()), ("frames per second", args.fps.to_string())],
     };

@@ -11,7 +11,7 @@ use muybridge::motion_model::{Activity, Model, database, synthetic};
 use muybridge::report::validation::ValidationReport;
 use muybridge::style::validate::{Score, validate};
 
-use super::motions::{ActivityName, TABLE, exclude, read_recordings};
+use super::motions::{ActivityName, TABLE, exclude, file_name, read_recordings};
 
 /// Components whose share of the variance is printed.
 const SHOWN_COMPONENTS: usize = 20;
@@ -180,7 +180,7 @@ fn run_validation(args: ValidateArgs) -> Result<()> {
     }
     let path = args.output.join("validation.csv");
     write_atomic(&path, csv.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
-    let (name, hash) = (args.model.display().to_string(), model_hash(&model));
+    let (name, hash) = (file_name(&args.model), model_hash(&model));
     let page = ValidationReport { model: &model, name: &name, hash: &hash, variance, validation: &validation }.html();
     let report = args.output.join("report.html");
     write_atomic(&report, page.as_bytes()).with_context(|| format!("cannot write {}", report.display()))?;

@@ -134,11 +134,11 @@ impl ValidationReport<'_> {
 
     fn subjects(&self) -> Markup {
         let methods = names(&self.validation.scores, |s| s.method);
-        let subjects = names(&self.validation.scores, |s| &s.left_out);
         let cell = |method: &str, subject: &str| self.value(method, "rms_deg", subject).map_or("\u{2013}".into(), |v| format!("{v:.2}"));
-        let rows: Vec<Vec<String>> = subjects
+        let rows: Vec<Vec<String>> = self
+            .model
+            .subjects()
             .into_iter()
-            .filter(|s| *s != "all")
             .map(|subject| {
                 let cycles = self.model.members.iter().filter(|m| m.subject == subject).count();
                 [subject.to_string(), cycles.to_string()].into_iter().chain(methods.iter().map(|m| cell(m, subject))).collect()
