@@ -19,12 +19,13 @@ pub mod clusters;
 pub mod curves;
 pub mod figures;
 pub mod maps;
+pub mod model;
 pub mod overlay;
 pub mod rig;
 
 pub use calibration::calibration;
 pub use clouds::{CloudDot, cloud_and_body};
-pub use clusters::clusters;
+pub use clusters::{clusters, database_clusters};
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::depth_map;
