@@ -7,17 +7,20 @@ use clap::{Args, ValueEnum};
 use muybridge::body::Shape;
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
+use muybridge::io::outputs_json::Source;
 use muybridge::io::style_json::read_style;
-use muybridge::io::{bvh, is_motion_file, write_atomic};
+use muybridge::io::{is_motion_file, write_atomic};
 use muybridge::motion::{Length, Synthesis, play, synthesize};
-use muybridge::motion_model::{Activity, Model};
+use muybridge::motion_model::{Activity, Cycle, Model};
+use muybridge::report::generated::{self, GeneratedReport};
 use muybridge::style::{Method, Metric, Population, Style};
 
 use super::model::default_variance;
-use super::motions::read_recordings;
+use super::motions::{file_name, read_recordings};
+use super::outputs::{Made, OutputArgs};
 
 /// Fractions of stature at which the hip joints stand.
-const HIP_OF_STATURE: f64 = 0.53;
+pub const HIP_OF_STATURE: f64 = 0.53;
 
 #[derive(Args)]
 pub struct GenerateArgs {
@@ -61,6 +64,8 @@ pub struct GenerateArgs {
     /// Frames per second
     #[arg(long, default_value_t = 60.0, value_parser = super::positive)]
     fps: f64,
+    #[command(flatten)]
+    files: OutputArgs,
 }
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
@@ -89,19 +94,49 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     let wanted = part.map_or(style.weights.len(), |v| model.components(v));
     let population = Population::new(&model, wanted.min(style.weights.len()));
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
+    let mut syntheses = Vec::new();
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
+    let mut motions = Vec::new();
     for (value, name) in values.iter().zip(&names) {
         let synthesis = synthesize(&model, &population, method, &style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
             eprintln!("notice: {name}: {notice}");
         }
         let clip = play(&model, &synthesis, &shape.offsets(), args.fps, length);
-        bvh::write_clip(&args.output.join(name), &clip, None)?;
         println!("{}: {} frames, {:.3} cycles/s", args.output.join(name).display(), clip.poses.len(), synthesis.frequency_hz);
         let _ = writeln!(table, "{}", table_row(name, &model, &synthesis));
+        let stem = name.trim_end_matches(".bvh").to_string();
+        motions.push(Made { stem, value: *value, clip, frequency_hz: synthesis.frequency_hz });
+        syntheses.push(synthesis);
     }
+    let source = Source { motion: file_name(&args.style), model: file_name(&args.model), model_hash: model_hash(&model) };
+    args.files.write(&args.output, &shape, source, &motions, &own_cycle(&model, &style))?;
     write_atomic(&args.output.join("generated.csv"), table.as_bytes()).with_context(|| args.output.display().to_string())?;
-    Ok(())
+    let made = names.iter().zip(&syntheses).zip(&motions);
+    report(&args, &model, &style, made.map(|((file, synthesis), motion)| generated::Made { file, synthesis, clip: &motion.clip }).collect())
+}
+
+/// Writes report.html.
+fn report(args: &GenerateArgs, model: &Model, style: &Style, made: Vec<generated::Made>) -> Result<()> {
+    let page = GeneratedReport {
+        model,
+        model_name: &args.model.display().to_string(),
+        style,
+        style_name: &args.style.display().to_string(),
+        made,
+        options: &[
+            ("weighing", if args.mahalanobis { "Mahalanobis" } else { "the paper's" }.to_string()),
+            ("frames per second", args.fps.to_string()),
+        ],
+    };
+    let path = args.output.join("report.html");
+    write_atomic(&path, page.html()?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// The person's motion as observed.
+fn own_cycle(model: &Model, style: &Style) -> Cycle {
+    let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(style.parameter, style.hip_height_m);
+    model.cycle(&style.weights, "", style.parameter, style.hip_height_m, 1.0 / frequency_hz)
 }
 
 fn table_row(name: &str, model: &Model, s: &Synthesis) -> String {

@@ -9,6 +9,7 @@ use muybridge::io::model_npz::{model_hash, read_model, write_model};
 use muybridge::io::write_atomic;
 use muybridge::motion_model::{Activity, Model, database, synthetic};
 use muybridge::report;
+use muybridge::report::validation::ValidationReport;
 use muybridge::style::validate::{METRICS, Score, validate};
 
 use super::motions::{ActivityName, exclude, read_recordings};
@@ -233,14 +234,18 @@ fn run_validation(args: ValidateArgs) -> Result<()> {
     if model.subjects().len() < 3 {
         bail!("{} has {} subjects; leaving one out needs at least three", args.model.display(), model.subjects().len());
     }
-    let validation = validate(&model, args.variance.unwrap_or(default_variance(model.activity)))?;
+    let variance = args.variance.unwrap_or(default_variance(model.activity));
+    let validation = validate(&model, variance)?;
     let table_of = |head: &str, scores: &[Score]| {
         let line = |s: &Score| format!("{},{},{},{:.6}\n", s.method, s.metric, s.left_out.replace(',', ";"), s.value);
         format!("{head}\n{}", scores.iter().map(line).collect::<String>())
     };
+    let (name, hash) = (args.model.display().to_string(), model_hash(&model));
+    let page = ValidationReport { model: &model, name: &name, hash: &hash, variance, validation: &validation }.html();
     for (name, text) in [
         ("validation.csv", table_of("method,metric,left_out,value", &validation.scores)),
         ("degrees.csv", table_of("method,angle,left_out,rms_deg", &validation.angles)),
+        ("report.html", page),
     ] {
         let path = args.output.join(name);
         write_atomic(&path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;

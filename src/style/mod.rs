@@ -8,6 +8,7 @@ pub mod curves;
 pub mod distance;
 pub mod extrapolate;
 pub mod transfer;
+pub mod space;
 pub mod validate;
 
 pub use curves::Population;
