@@ -87,7 +87,9 @@ fn runners_agree_with_their_own_inverse_kinematics() {
         let first_s = column(&mot, "hip_flexion_r")[0].0;
         let found = differences(&solved.clip, first_s + solved.first_frame as f64 / markers.fps, &mot, -1.0);
         println!("{subject} {speed} m/s: markers {:.1} mm; {}", 1e3 * solved.rms_m, line(&found));
-        for j in [Joint::LKnee, Joint::LAnkle, Joint::RKnee, Joint::RAnkle] { print!(" {:.3}", solved.clip.offsets[j as usize].norm()); }
+        for j in [Joint::LKnee, Joint::LAnkle, Joint::RKnee, Joint::RAnkle] {
+            print!(" {:.3}", solved.clip.offsets[j as usize].norm());
+        }
         println!(" hips {:.3}", solved.clip.offsets[Joint::LHip as usize].x);
     }
 }
@@ -111,7 +113,9 @@ fn walkers_agree_with_their_own_inverse_kinematics() {
         let mot = c3d.parent().unwrap().join(format!("../ik/{trial}/{trial}_ik.mot"));
         let found = differences(&solved.clip, solved.first_frame as f64 / markers.fps, &mot, 1.0);
         println!("{stem}: markers {:.1} mm; {}", 1e3 * solved.rms_m, line(&found));
-        for j in [Joint::LKnee, Joint::LAnkle, Joint::RKnee, Joint::RAnkle] { print!(" {:.3}", solved.clip.offsets[j as usize].norm()); }
+        for j in [Joint::LKnee, Joint::LAnkle, Joint::RKnee, Joint::RAnkle] {
+            print!(" {:.3}", solved.clip.offsets[j as usize].norm());
+        }
         println!(" hips {:.3}", solved.clip.offsets[Joint::LHip as usize].x);
         let _ = log(&UnitQuaternion::identity());
     }

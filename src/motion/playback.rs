@@ -46,6 +46,16 @@ pub enum Length {
     Seconds(f64),
 }
 
+impl Length {
+    /// Duration for cycles that repeat `frequency_hz` times a second.
+    pub fn seconds(self, frequency_hz: f64) -> f64 {
+        match self {
+            Length::Cycles(n) => n as f64 / frequency_hz,
+            Length::Seconds(s) => s,
+        }
+    }
+}
+
 /// Weights and cadence of `style` at `parameter` for a body with `hip_height_m`; `population` comes from the same model.
 pub fn synthesize(
     model: &Model,
@@ -101,9 +111,8 @@ type Posture<'a> = &'a dyn Fn(f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootS
 impl Ride {
     fn clip(&self, posture: Posture, offsets: &[Vector3<f64>; NODES], fps: f64, length: Length) -> Clip {
         let seconds = match length {
-            Length::Cycles(n) if self.cyclic => n as f64 / self.frequency_hz,
-            Length::Seconds(s) => s,
-            Length::Cycles(_) => 1.0 / self.frequency_hz,
+            Length::Cycles(_) if !self.cyclic => 1.0 / self.frequency_hz,
+            _ => length.seconds(self.frequency_hz),
         };
         let frames = (seconds * fps).round() as usize + 1;
         let poses = (0..frames)

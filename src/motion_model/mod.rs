@@ -3,15 +3,14 @@
 pub mod cadence;
 pub mod cycle;
 pub mod database;
-pub mod markers;
 pub mod gait;
+pub mod markers;
 pub mod model;
 pub mod segment;
 pub mod synthetic;
 
 pub use cadence::CadenceLaw;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
-pub use model::{Detail, Member, Model, ModelError};
 pub use gait::{Gait, gait};
-pub use model::{Member, Model, ModelError};
+pub use model::{Detail, Member, Model, ModelError};
 pub use segment::{Label, Segments, segment};

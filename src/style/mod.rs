@@ -7,8 +7,8 @@ pub mod angles;
 pub mod curves;
 pub mod distance;
 pub mod extrapolate;
-pub mod transfer;
 pub mod space;
+pub mod transfer;
 pub mod validate;
 
 pub use curves::Population;
@@ -130,6 +130,12 @@ impl Style {
             Method::Default => transfer(population, &self.observations(), parameter),
             Method::Paper(metric) => extrapolate(population, metric, &self.weights, self.parameter, parameter),
         }
+    }
+
+    /// With what was seen of the same person at other times; the first observation stays the main one.
+    pub fn and(mut self, other: Style) -> Style {
+        self.also.extend(other.observations());
+        self
     }
 
     /// All that was seen of the person.

@@ -42,9 +42,13 @@ pub enum IkError {
     Lying,
     #[error("the markers span a person of {size:.3} units, which is no human size in m, cm or mm; correct the file's unit of length")]
     Size { size: f64 },
-    #[error("no stretch of frames shows three markers of the pelvis where {set} puts them; correct the names or describe your set in markers.toml")]
+    #[error(
+        "no stretch of frames shows three markers of the pelvis where {set} puts them; correct the names or describe your set in markers.toml"
+    )]
     NoPelvis { set: String },
-    #[error("half of the markers are farther than {median_m:.2} m from any body: left and right or other names are exchanged, or {set} is not the set used")]
+    #[error(
+        "half of the markers are farther than {median_m:.2} m from any body: left and right or other names are exchanged, or {set} is not the set used"
+    )]
     NoBody { median_m: f64, set: String },
 }
 
