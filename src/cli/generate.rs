@@ -34,6 +34,10 @@ pub struct GenerateArgs {
     /// style.json of `track`, or a motion file of the person
     #[arg(long)]
     style: PathBuf,
+    /// The same person at another speed or length, style.json or motion file, the latter with its speed where that cannot be
+    /// measured: run.mot@4m/s; repeat for several
+    #[arg(long, value_name = "STYLE")]
+    also: Vec<String>,
     /// Speeds or jump lengths: 3km/h, 1.25m/s, 80cm; bare numbers are m/s, for jumps m
     #[arg(long, required_unless_present = "profile", value_delimiter = ',')]
     at: Vec<String>,
@@ -111,7 +115,11 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     if !model.activity.is_cyclic() && (args.profile.is_some() || args.turn_radius.is_some()) {
         bail!("{} holds jumps; --profile and --turn-radius are for walking and running", args.model.display());
     }
-    let style = load_style(&args.model, &model, &args.style, args.recorded_at.as_deref())?;
+    let mut style = load_style(&args.model, &model, &args.style, args.recorded_at.as_deref())?;
+    for text in &args.also {
+        let (path, recorded_at) = text.rsplit_once('@').map_or((text.as_str(), None), |(path, at)| (path, Some(at)));
+        style = style.and(load_style(&args.model, &model, Path::new(path), recorded_at)?);
+    }
     let shape = target_shape(&args, &style);
     match &args.profile {
         Some(text) => along_profile(&args, &model, &style, &shape, &profile::read(text, args.turn_radius)?),

@@ -22,6 +22,7 @@ pub mod curves;
 pub mod figures;
 pub mod generated;
 pub mod maps;
+pub mod model;
 pub mod marks;
 pub mod overlay;
 pub mod page;
@@ -38,7 +39,7 @@ pub mod walk;
 
 pub use calibration::calibration;
 pub use clouds::{CloudDot, cloud_and_body};
-pub use clusters::clusters;
+pub use clusters::{clusters, database_clusters};
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::{depth_map, person_depth};
