@@ -3,7 +3,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use muybridge::body::{Clip, Shape};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
@@ -13,7 +13,8 @@ use muybridge::io::{is_motion_file, write_atomic};
 use muybridge::motion::player::ACCELERATION_M_S2;
 use muybridge::motion::{Gait, Gaits, Length, Profile, Step, Synthesis, follow, plant_feet, play, synthesize};
 use muybridge::motion_model::{Activity, Cycle, Model};
-use muybridge::style::{Metric, Population, Style};
+use muybridge::report::generated::{self, GeneratedReport};
+use muybridge::style::{Method, Metric, Population, Style};
 
 use super::model::default_variance;
 use super::motions::{file_name, read_recordings};
@@ -67,10 +68,14 @@ pub struct GenerateArgs {
     /// Hip-joint height in metres of the body that moves
     #[arg(long, value_parser = super::positive)]
     leg_length: Option<f64>,
-    /// Part of the variance that the components in use hold; 0.90 for walking, else 0.95
+    /// How the style is carried: `default` keeps the person's own motion and adds the change of like people, `paper` is the
+    /// weighted sum of the database's people
+    #[arg(long, value_enum, default_value = "default")]
+    method: MethodName,
+    /// Part of the variance that the components in use hold; all the style has, for `--method paper` 0.90 of walking, else 0.95
     #[arg(long, value_parser = super::part)]
     variance: Option<f64>,
-    /// Weigh database subjects by the true Mahalanobis distance in place of the paper's
+    /// With `--method paper`: weigh database subjects by the true Mahalanobis distance in place of the paper's
     #[arg(long)]
     mahalanobis: bool,
     /// Gait cycles per motion
@@ -84,6 +89,21 @@ pub struct GenerateArgs {
     fps: f64,
     #[command(flatten)]
     files: OutputArgs,
+}
+
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum MethodName {
+    Default,
+    Paper,
+}
+
+fn method(args: &GenerateArgs) -> Result<Method> {
+    match (args.method, args.mahalanobis) {
+        (MethodName::Default, false) => Ok(Method::Default),
+        (MethodName::Paper, false) => Ok(Method::Paper(Metric::Paper)),
+        (MethodName::Paper, true) => Ok(Method::Paper(Metric::Mahalanobis)),
+        (MethodName::Default, true) => bail!("--mahalanobis is a distance of --method paper; give both"),
+    }
 }
 
 pub fn run(args: GenerateArgs) -> Result<()> {
@@ -102,12 +122,12 @@ pub fn run(args: GenerateArgs) -> Result<()> {
 fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Result<()> {
     let values: Vec<f64> = args.at.iter().map(|v| parameter(v, model.activity)).collect::<Result<_>>()?;
     let names = file_names(model.activity, &values)?;
-    let (population, metric) = (population(args, model, style), metric(args));
+    let (population, method) = (population(args, model, style)?, method(args)?);
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
-    let mut motions = Vec::new();
+    let (mut motions, mut syntheses) = (Vec::new(), Vec::new());
     for (value, name) in values.iter().zip(&names) {
-        let synthesis = synthesize(model, &population, metric, style, *value, shape.hip_height_m())?;
+        let synthesis = synthesize(model, &population, method, style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
             eprintln!("notice: {name}: {notice}");
         }
@@ -124,10 +144,12 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -
         let _ = writeln!(table, "{}", table_row(name, model, &synthesis));
         let stem = name.trim_end_matches(".bvh").to_string();
         motions.push(Made { stem, value: *value, clip, frequency_hz: synthesis.frequency_hz });
+        syntheses.push(synthesis);
     }
     write_files(args, model, style, shape, &motions)?;
     write_atomic(&args.output.join("generated.csv"), table.as_bytes()).with_context(|| args.output.display().to_string())?;
-    Ok(())
+    let made = names.iter().zip(&syntheses).zip(&motions);
+    report(args, model, style, made.map(|((file, synthesis), motion)| generated::Made { file, synthesis, clip: &motion.clip }).collect())
 }
 
 /// One motion whose speed varies over time.
@@ -170,8 +192,8 @@ fn steps_csv(steps: &[Step]) -> String {
 }
 
 fn gait(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Result<Gait> {
-    let population = population(args, model, style);
-    let found = Gait::of_style(model, &population, metric(args), style, shape.hip_height_m(), &shape.offsets())?;
+    let population = population(args, model, style)?;
+    let found = Gait::of_style(model, &population, method(args)?, style, shape.hip_height_m(), &shape.offsets())?;
     let (gait, notice) = found.with_context(|| format!("the speeds of {} make no gait", model.activity))?;
     if let Some(notice) = notice {
         eprintln!("notice: {notice}");
@@ -211,13 +233,24 @@ fn write_files(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape,
     args.files.write(&args.output, shape, source, motions, &own_cycle(model, style))
 }
 
-fn metric(args: &GenerateArgs) -> Metric {
-    if args.mahalanobis { Metric::Mahalanobis } else { Metric::Paper }
+fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Result<Population> {
+    let part = args.variance.or((method(args)? != Method::Default).then(|| default_variance(model.activity)));
+    let wanted = part.map_or(style.weights.len(), |v| model.components(v));
+    Ok(Population::new(model, wanted.min(style.weights.len())))
 }
 
-fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Population {
-    let wanted = model.components(args.variance.unwrap_or(default_variance(model.activity)));
-    Population::new(model, wanted.min(style.weights.len()))
+/// Writes report.html.
+fn report(args: &GenerateArgs, model: &Model, style: &Style, made: Vec<generated::Made>) -> Result<()> {
+    let page = GeneratedReport {
+        model,
+        model_name: &args.model.display().to_string(),
+        style,
+        style_name: &args.style.display().to_string(),
+        made,
+        options: &[("method", method(args)?.to_string()), ("frames per second", args.fps.to_string())],
+    };
+    let path = args.output.join("report.html");
+    write_atomic(&path, page.html()?.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// The person's motion as observed.

@@ -1,5 +1,6 @@
 //! One file per subcommand: load, call the library, save, report.
 mod animal;
+mod batch;
 mod bench;
 mod blend;
 mod board;
@@ -19,6 +20,7 @@ mod progress;
 mod render;
 mod rig;
 mod track;
+mod track_report;
 mod whole;
 
 use anyhow::Result;
@@ -59,6 +61,8 @@ enum Command {
     Blend(blend::BlendCommand),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
+    /// Every session of a study, whatever breaks on the way; results that are there already are kept
+    Batch(batch::BatchArgs),
     /// From one video of an animal to its motion
     #[command(subcommand)]
     Animal(animal::AnimalCommand),
@@ -87,6 +91,7 @@ pub fn run(cli: Cli) -> Result<()> {
     interrupt::catch();
     match cli.command {
         Command::Demo(args) => demo::run(&args),
+        Command::Batch(args) => batch::run(&args, cli.threads),
         Command::Check(args) => check::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Clouds(args) => clouds::run(&args),
@@ -100,6 +105,12 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Generate(args) => generate::run(args),
         Command::Blend(command) => blend::run(command),
     }
+}
+
+/// This program, also when its file was replaced since it began.
+fn executable() -> std::path::PathBuf {
+    let running = std::path::Path::new("/proc/self/exe");
+    if running.exists() { running.to_path_buf() } else { std::env::current_exe().unwrap_or_else(|_| "muybridge".into()) }
 }
 
 fn positive(text: &str) -> Result<f64, String> {

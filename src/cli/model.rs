@@ -8,6 +8,7 @@ use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model, write_model};
 use muybridge::io::write_atomic;
 use muybridge::motion_model::{Activity, Model, database, synthetic};
+use muybridge::report::validation::ValidationReport;
 use muybridge::style::validate::{Score, validate};
 
 use super::motions::{ActivityName, exclude, read_recordings};
@@ -164,16 +165,21 @@ fn run_validation(args: ValidateArgs) -> Result<()> {
     if model.subjects().len() < 3 {
         bail!("{} has {} subjects; leaving one out needs at least three", args.model.display(), model.subjects().len());
     }
-    let validation = validate(&model, args.variance.unwrap_or(default_variance(model.activity)))?;
+    let variance = args.variance.unwrap_or(default_variance(model.activity));
+    let validation = validate(&model, variance)?;
     let mut csv = String::from("method,metric,left_out,value\n");
     for s in &validation.scores {
         let _ = writeln!(csv, "{},{},{},{:.6}", s.method, s.metric, s.left_out.replace(',', ";"), s.value);
     }
     let path = args.output.join("validation.csv");
     write_atomic(&path, csv.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
+    let (name, hash) = (args.model.display().to_string(), model_hash(&model));
+    let page = ValidationReport { model: &model, name: &name, hash: &hash, variance, validation: &validation }.html();
+    let report = args.output.join("report.html");
+    write_atomic(&report, page.as_bytes()).with_context(|| format!("cannot write {}", report.display()))?;
     print!("{}", table(&validation.scores));
     println!("{} cases, in {} of them too few other subjects were recorded at both parameters", validation.cases, validation.sparse_cases);
-    println!("written: {}", path.display());
+    println!("written: {} and report.html beside it", path.display());
     Ok(())
 }
 

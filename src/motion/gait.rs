@@ -20,7 +20,7 @@ use super::playback::{Synthesis, synthesize};
 use crate::body::{BALL_JOINTS, DOF, Joint, NODES, Pose, place};
 use crate::math::rotation::{exp, log};
 use crate::motion_model::{Activity, Model, ROOT_CHANNELS, SAMPLES};
-use crate::style::{Metric, Population, Style, StyleError};
+use crate::style::{Method, Population, Style, StyleError};
 
 /// Joint coordinates and root channels of one sample.
 pub const CHANNELS: usize = DOF + ROOT_CHANNELS;
@@ -71,7 +71,7 @@ impl Gait {
             mean_rotations: model.mean_rotations,
             slowest_m_s: first.parameter,
             step_m_s,
-            cycles: knots.iter().map(|s| rows(&model.vector(s.weights.as_slice()), &model.root(s.weights.as_slice()))).collect(),
+            cycles: knots.iter().map(|s| cycle(model, s)).collect(),
             frequencies_hz: knots.iter().map(|s| s.frequency_hz).collect(),
             stand: [0.0; CHANNELS],
             start_phase: 0.0,
@@ -86,13 +86,13 @@ impl Gait {
     pub fn of_style(
         model: &Model,
         population: &Population,
-        metric: Metric,
+        method: Method,
         style: &Style,
         hip_height_m: f64,
         offsets: &[Vector3<f64>; NODES],
     ) -> Result<Option<(Gait, Option<String>)>, StyleError> {
         let speeds = speeds(model, hip_height_m / style.hip_height_m);
-        let knots = speeds.into_iter().map(|v| synthesize(model, population, metric, style, v, hip_height_m));
+        let knots = speeds.into_iter().map(|v| synthesize(model, population, method, style, v, hip_height_m));
         let knots = knots.collect::<Result<Vec<Synthesis>, StyleError>>()?;
         let noticed = knots.iter().filter(|s| s.notice.is_some()).count();
         let first = knots.iter().find_map(|s| s.notice.as_deref());
@@ -115,7 +115,7 @@ impl Gait {
             let at = v * recorded_m / hip_height_m;
             let weights = population.curves.iter().map(|c| population.extended(c, at)).sum::<DVector<f64>>() / count;
             let frequency_hz = model.cadence().frequency_hz(v, hip_height_m);
-            Synthesis { weights, parameter: v, hip_height_m, frequency_hz, shares: Vec::new(), notice: None }
+            Synthesis { weights, detail: None, sd: None, parameter: v, hip_height_m, frequency_hz, shares: Vec::new(), notice: None }
         };
         let knots: Vec<Synthesis> = speeds(model, hip_height_m / recorded_m).into_iter().map(knot).collect();
         Gait::new(model, &knots, offsets)
@@ -262,6 +262,17 @@ fn speeds(model: &Model, scale: f64) -> Vec<f64> {
     let (low, high) = (low * scale, high.max(low + STEP_M_S) * scale);
     let steps = ((high - low) / STEP_M_S).ceil().max(1.0);
     (0..=steps as usize).map(|k| low + (high - low) * k as f64 / steps).collect()
+}
+
+/// The cycle of a synthesis as [`rows`].
+fn cycle(model: &Model, synthesis: &Synthesis) -> Vec<f64> {
+    let weights = synthesis.weights.as_slice();
+    let (mut joints, mut root) = (model.vector(weights), model.root(weights));
+    if let Some(detail) = &synthesis.detail {
+        joints += &detail.vector;
+        root += &detail.root;
+    }
+    rows(&joints, &root)
 }
 
 /// Joint coordinates and root channels side by side, one row per sample.

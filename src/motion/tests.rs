@@ -11,7 +11,7 @@ use crate::body::{Clip, Joint, NODES, Pose, Shape};
 use crate::math::rotation::log;
 use crate::motion::{Length, synthesize};
 use crate::motion_model::{Activity, Model, synthetic};
-use crate::style::{Metric, Population, Style};
+use crate::style::{Method, Population, Style};
 
 const WALKS: [f64; 4] = [0.8, 1.2, 1.6, 2.0];
 const RUNS: [f64; 4] = [1.8, 2.3, 2.8, 3.4];
@@ -36,7 +36,7 @@ fn style(model: &Model, speed: f64) -> Style {
 fn gait(model: &Model, speed: f64) -> Gait {
     let style = style(model, speed);
     let population = Population::new(model, style.weights.len());
-    Gait::of_style(model, &population, Metric::Paper, &style, hip_height_m(), &offsets()).unwrap().unwrap().0
+    Gait::of_style(model, &population, Method::Default, &style, hip_height_m(), &offsets()).unwrap().unwrap().0
 }
 
 fn gaits() -> Gaits {
@@ -81,13 +81,13 @@ fn a_steady_gait_plays_the_models_postures() {
     let model = model(Activity::Walking, WALKS);
     let style = style(&model, 1.2);
     let population = Population::new(&model, style.weights.len());
-    let at = |v: f64| synthesize(&model, &population, Metric::Paper, &style, v, hip_height_m()).unwrap();
+    let at = |v: f64| synthesize(&model, &population, Method::Default, &style, v, hip_height_m()).unwrap();
     let synthesis = at(1.3);
     let steady = Gait::steady(&model, &synthesis, &offsets()).unwrap();
     let over_speeds = gait(&model, 1.2);
     for k in 0..100 {
         let phase = f64::from(k) / 100.0;
-        let (joints, root) = model.posture(synthesis.weights.as_slice(), phase);
+        let (joints, root) = model.posture_with(synthesis.weights.as_slice(), synthesis.detail.as_ref(), phase);
         let posture = steady.posture(1.3, phase, std::iter::empty());
         assert!(posture.joints.iter().zip(&joints).all(|(a, b)| a.angle_to(b) < 1e-7));
         assert!((posture.root - root.position).norm() < 1e-9);

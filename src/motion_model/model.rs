@@ -34,6 +34,25 @@ pub struct Member {
     pub root: DVector<f64>,
 }
 
+/// What of a cycle the weights of a model do not hold, as vectors of [`Member::vector`] and [`Member::root`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Detail {
+    pub vector: DVector<f64>,
+    pub root: DVector<f64>,
+}
+
+impl Detail {
+    /// Weighted sum; `None` of nothing.
+    pub fn sum<'a>(parts: impl Iterator<Item = (&'a Detail, f64)>) -> Option<Detail> {
+        parts.fold(None, |sum: Option<Detail>, (part, weight)| {
+            let mut sum = sum.unwrap_or_else(|| Detail { vector: DVector::zeros(part.vector.len()), root: DVector::zeros(part.root.len()) });
+            sum.vector.axpy(weight, &part.vector, 1.0);
+            sum.root.axpy(weight, &part.root, 1.0);
+            Some(sum)
+        })
+    }
+}
+
 /// Mean, principal components and members of one activity's database.
 #[derive(Clone, Debug)]
 pub struct Model {
@@ -154,10 +173,25 @@ impl Model {
     /// Joint rotations (index `joint as usize - 1`) and root at `phase`, interpolated linearly between the neighbouring
     /// samples; a gait's phase wraps, a jump's is held at its ends.
     pub fn posture(&self, weights: &[f64], phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
+        self.posture_with(weights, None, phase)
+    }
+
+    /// [`Model::posture`] with what the weights do not hold.
+    pub fn posture_with(
+        &self,
+        weights: &[f64],
+        detail: Option<&Detail>,
+        phase: f64,
+    ) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
         let (before, after, part) = neighbours(self.activity, phase);
         let at = |sample: usize| {
-            let joints = combine_rows(&self.mean, &self.basis, weights, sample * DOF, DOF);
-            (joints, combine_rows(&self.root_mean, &self.root_basis, weights, sample * ROOT_CHANNELS, ROOT_CHANNELS))
+            let mut joints = combine_rows(&self.mean, &self.basis, weights, sample * DOF, DOF);
+            let mut root = combine_rows(&self.root_mean, &self.root_basis, weights, sample * ROOT_CHANNELS, ROOT_CHANNELS);
+            if let Some(detail) = detail {
+                joints += detail.vector.rows(sample * DOF, DOF);
+                root += detail.root.rows(sample * ROOT_CHANNELS, ROOT_CHANNELS);
+            }
+            (joints, root)
         };
         let ((joints0, root0), (joints1, root1)) = (at(before), at(after));
         let joints = joints0.lerp(&joints1, part);
@@ -168,16 +202,15 @@ impl Model {
     /// The whole cycle of weights; subject, parameter and size as given.
     pub fn cycle(&self, weights: &[f64], subject: &str, parameter: f64, hip_height_m: f64, duration_s: f64) -> Cycle {
         let (vector, root) = (self.vector(weights), self.root(weights));
-        Cycle {
+        self.cycle_of(&Member {
             subject: subject.to_string(),
             source: "synthesized".to_string(),
-            activity: self.activity,
             parameter,
             hip_height_m,
             duration_s,
-            joints: (0..SAMPLES).map(|k| rotations(&self.mean_rotations, vector.rows(k * DOF, DOF))).collect(),
-            root: (0..SAMPLES).map(|k| root_sample(root.rows(k * ROOT_CHANNELS, ROOT_CHANNELS))).collect(),
-        }
+            vector,
+            root,
+        })
     }
 
     /// A cycle as a member: its vector is relative to this model's mean rotations.

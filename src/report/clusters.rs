@@ -57,7 +57,7 @@ pub fn clusters(model: &Model, weights: &[f64], covariance: Option<[[f64; 2]; 2]
 }
 
 /// The 95 % ellipse of covariance [xx, xy, yy] about a point.
-fn ellipse(centre: [f64; 2], [xx, xy, yy]: [f64; 3]) -> Vec<[f64; 2]> {
+pub(super) fn ellipse(centre: [f64; 2], [xx, xy, yy]: [f64; 3]) -> Vec<[f64; 2]> {
     let axes = SymmetricEigen::new(nalgebra::Matrix2::new(xx, xy, xy, yy));
     let half = axes.eigenvalues.map(|v| ELLIPSE * v.max(0.0).sqrt());
     let at = |k: i32| {

@@ -8,13 +8,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
-use muybridge::body::Shape;
+use muybridge::body::{Clip, Shape};
 use muybridge::io::manifest::{Entry, find_motions};
 use muybridge::io::{bvh, is_motion_file, read_clip, write_atomic};
 use muybridge::motion_model::Activity;
 use muybridge::report;
 use muybridge::report::strips::{FROM_THE_FRONT_RIGHT, Phases, Strip, strips};
-use muybridge::style::space::{Example, Space, Vectors, measure};
+use muybridge::style::space::{Blend, Example, Space, Vectors, measure};
 
 use super::generate::HIP_OF_STATURE;
 use super::motions::read_recordings;
@@ -115,8 +115,8 @@ fn save_strip(path: &Path, space: &Space, motions: &[Made]) -> Result<()> {
         (blend.clip(&shape.offsets(), shape.hip_height_m(), 100.0 / blend.duration_s(), 1), blend)
     };
     let played: Vec<_> = motions.iter().map(play).collect();
-    let row = |(m, (clip, blend)): (&Made, &(Clip, _))| {
-        let made = Phases { clip, cycle_s: Blend::duration_s(blend) };
+    let row = |(m, (clip, blend)): (&Made, &(Clip, Blend))| {
+        let made = Phases { clip, cycle_s: blend.duration_s() };
         Strip { label: m.label.clone(), made, recorded: None, cyclic: blend.is_cyclic() }
     };
     let rows: Vec<Strip> = motions.iter().zip(&played).map(row).collect();
