@@ -111,6 +111,28 @@ fn a_steady_gait_plays_the_models_postures() {
 }
 
 #[test]
+fn a_body_of_half_the_size_moves_alike_at_half_the_speed() {
+    let model = model(Activity::Walking, WALKS);
+    let style = style(&model, 1.2);
+    let population = Population::new(&model, style.weights.len());
+    let [large, small] = [1.7, 0.85].map(|stature_m| {
+        let shape = Shape::template(stature_m);
+        Gait::of_style(&model, &population, Method::Default, &style, shape.hip_height_m(), &shape.offsets()).unwrap().unwrap().0
+    });
+    let (a, b) = (large.range_m_s(), small.range_m_s());
+    assert!((a.0 / b.0 - 2.0).abs() < 1e-9 && (a.1 / b.1 - 2.0).abs() < 1e-9);
+    for phase in [0.1, 0.45, 0.8] {
+        let (p, q) = (large.posture(1.4, phase, std::iter::empty()), small.posture(0.7, phase, std::iter::empty()));
+        assert!(p.joints.iter().zip(&q.joints).all(|(p, q)| p.angle_to(q) < 0.01) && (p.root - q.root).norm() < 1e-3);
+        let same_speed = small.posture(1.0, phase, std::iter::empty());
+        assert!(same_speed.joints.iter().zip(&q.joints).any(|(p, q)| p.angle_to(q) > 0.03));
+    }
+    assert!((large.frequency_hz(1.4) / small.frequency_hz(0.7) - 1.0).abs() < 0.01);
+    let runs = Gaits::walk_and_run(small.clone(), small).transition_m_s().unwrap();
+    assert!((runs - (0.25 * 9.81 * hip_height_m()).sqrt()).abs() < 1e-9);
+}
+
+#[test]
 fn who_stands_has_straight_legs_and_flat_soles_on_the_floor() {
     let gaits = gaits();
     let pose = Player::new(&gaits, 0.0, 0.0).pose();
