@@ -19,7 +19,7 @@ use nalgebra::{DVector, UnitQuaternion, Vector3};
 use super::playback::{Synthesis, synthesize};
 use crate::body::{BALL_JOINTS, DOF, Joint, NODES, Pose, place};
 use crate::math::rotation::{exp, log};
-use crate::motion_model::{Activity, Model, ROOT_CHANNELS, SAMPLES};
+use crate::motion_model::{Activity, Cycle, Model, ROOT_CHANNELS, SAMPLES};
 use crate::style::{Method, Population, Style, StyleError};
 
 /// Joint coordinates and root channels of one sample.
@@ -157,6 +157,22 @@ impl Gait {
             (DOF..CHANNELS).for_each(|i| row[i] -= theirs[i]);
         }
         own
+    }
+
+    /// What separates one cycle from another as a change for [`Gait::add_change`]: an attribute, made where labels are known.
+    pub fn change(&self, from: &Cycle, to: &Cycle) -> Vec<f64> {
+        let coordinates = |cycle: &Cycle| {
+            let mut rows = Vec::with_capacity(SAMPLES * CHANNELS);
+            for (joints, root) in cycle.joints.iter().zip(&cycle.root) {
+                for (mean, joint) in self.mean_rotations.iter().zip(joints) {
+                    rows.extend_from_slice(log(&(mean.inverse() * joint)).as_slice());
+                }
+                rows.extend_from_slice(root.rotation.as_slice());
+                rows.extend_from_slice(root.position.as_slice());
+            }
+            rows
+        };
+        coordinates(to).iter().zip(coordinates(from)).map(|(b, a)| b - a).collect()
     }
 
     /// Cycles per second at a speed.

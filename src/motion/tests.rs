@@ -9,8 +9,8 @@ use super::player::{Eased, GRAVITY_M_S2, Gaits, Player};
 use super::{Profile, Waypoint, follow, plant_feet, play};
 use crate::body::{Clip, Joint, NODES, Pose, Shape};
 use crate::math::rotation::log;
-use crate::motion::{Length, synthesize};
-use crate::motion_model::{Activity, Model, synthetic};
+use crate::motion::{Length, Synthesis, synthesize};
+use crate::motion_model::{Activity, Cycle, Model, synthetic};
 use crate::style::{Method, Population, Style};
 
 const WALKS: [f64; 4] = [0.8, 1.2, 1.6, 2.0];
@@ -305,6 +305,25 @@ fn changes_are_mixed_in_smoothly_while_it_plays() {
     let (mixed, lively) = (roughness(&clip), steady(2.0));
     assert!(mixed[1] < 1.1 * lively[1] && mixed[3] < 1.1 * lively[3], "rougher than either: {mixed:?} {lively:?}");
     assert!(lively[1] > 1.2 * steady(0.0)[1]);
+}
+
+#[test]
+fn the_change_between_two_cycles_turns_one_into_the_other() {
+    let [a, b] = [7, 8].map(|seed| synthetic::subject(Activity::Walking, seed).mean_cycle(1.2));
+    let model = Model::build(Activity::Walking, true, &[a.clone(), b.clone()]).unwrap();
+    let weights = model.project(&model.vector_of(&a));
+    let (hip_height_m, frequency_hz) = (a.hip_height_m, 1.0 / a.duration_s);
+    let (shares, detail, sd, notice) = (Vec::new(), None, None, None);
+    let synthesis = Synthesis { weights, detail, sd, parameter: 1.2, hip_height_m, frequency_hz, shares, notice };
+    let mut gait = Gait::steady(&model, &synthesis, &offsets()).unwrap();
+    let change = gait.change(&a, &b);
+    gait.add_change(change).unwrap();
+    for k in 0..100 {
+        let at = |amount: f64| gait.posture(1.2, k as f64 / 100.0, [amount].into_iter());
+        let off =
+            |amount: f64, cycle: &Cycle| at(amount).joints.iter().zip(&cycle.joints[k]).map(|(p, q)| p.angle_to(q)).fold(0.0, f64::max);
+        assert!(off(0.0, &a) < 1e-6 && off(1.0, &b) < 1e-6 && off(0.0, &b) > 0.01, "{k}: {} {}", off(0.0, &a), off(1.0, &b));
+    }
 }
 
 /// Largest drift in m of a point of the sole while it touches (within 2 mm of the lowest), over one contact.
