@@ -156,7 +156,8 @@ fn recorded(clip: &Clip, set: &MarkerSet) -> Markers {
 fn worst_sagittal_deg(a: &Clip, b: &Clip) -> f64 {
     use Joint::*;
     let rms = |joint: Joint| {
-        let off: Vec<f64> = a.poses.iter().zip(&b.poses).map(|(a, b)| sagittal_deg(a.joint(joint)) - sagittal_deg(b.joint(joint))).collect();
+        let off: Vec<f64> =
+            a.poses.iter().zip(&b.poses).map(|(a, b)| sagittal_deg(a.joint(joint)) - sagittal_deg(b.joint(joint))).collect();
         let mean = off.iter().sum::<f64>() / off.len() as f64;
         (off.iter().map(|o| (o - mean).powi(2)).sum::<f64>() / off.len() as f64).sqrt()
     };

@@ -47,7 +47,9 @@ fn expected(data: &Path) -> Vec<Expected> {
 fn found(entries: &[Entry], e: &Expected) -> Result<(usize, f64), String> {
     let is_it = |x: &&Entry| {
         let path = x.path.to_string_lossy();
-        path.contains(e.folder) && x.path.file_stem().is_some_and(|s| s.to_string_lossy() == e.trial) && (e.folder != "hamner-running" || path.contains(&e.subject))
+        path.contains(e.folder)
+            && x.path.file_stem().is_some_and(|s| s.to_string_lossy() == e.trial)
+            && (e.folder != "hamner-running" || path.contains(&e.subject))
     };
     let entry = entries.iter().find(is_it).ok_or("not there")?;
     let read = read_clip(&entry.path).map_err(|e| e.to_string())?;
@@ -74,7 +76,8 @@ fn cycles_and_speeds_of_every_shared_trial() {
     }
     let folders: Vec<PathBuf> = SETS.iter().map(|s| data.join(s.1)).collect();
     let entries = find_motions(&folders, None).unwrap();
-    let rows: Vec<(Expected, Result<(usize, f64), String>)> = expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
+    let rows: Vec<(Expected, Result<(usize, f64), String>)> =
+        expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
     for (e, found) in &rows {
         let what = match found {
             Ok((cycles, speed)) => format!("{cycles:>2} {speed:>6.2}"),

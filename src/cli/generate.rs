@@ -132,9 +132,8 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -
     let names = file_names(model.activity, &values)?;
     let (population, method) = (population(args, model, style)?, method(args)?);
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
-    let mut syntheses = Vec::new();
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
-    let mut motions = Vec::new();
+    let (mut motions, mut syntheses) = (Vec::new(), Vec::new());
     for (value, name) in values.iter().zip(&names) {
         let synthesis = synthesize(model, &population, method, style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
@@ -265,10 +264,7 @@ fn write_files(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape,
 }
 
 fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Result<Population> {
-    let part = args.variance.or(match method(args)? {
-        Method::Default => None,
-        Method::Paper(_) => Some(default_variance(model.activity)),
-    });
+    let part = args.variance.or((method(args)? != Method::Default).then(|| default_variance(model.activity)));
     let wanted = part.map_or(style.weights.len(), |v| model.components(v));
     Ok(Population::new(model, wanted.min(style.weights.len())))
 }

@@ -46,7 +46,8 @@ fn parse(text: &str) -> Result<(Markers, Vec<String>), Fault> {
     if !lines.first().is_some_and(|l| l.trim_start_matches('\u{feff}').starts_with("PathFileType")) {
         return Err((1, "does not begin with PathFileType: this is no TRC file".into()));
     }
-    let words = |line: usize| -> Vec<&str> { lines.get(line).map(|l| l.split(separates).filter(|w| !w.is_empty()).collect()).unwrap_or_default() };
+    let words =
+        |line: usize| -> Vec<&str> { lines.get(line).map(|l| l.split(separates).filter(|w| !w.is_empty()).collect()).unwrap_or_default() };
     let (fields, values) = (words(1), words(2));
     let field = |name: &str| fields.iter().position(|f| *f == name).and_then(|i| values.get(i).copied());
     let header = at(3);

@@ -44,9 +44,13 @@ pub enum IkError {
     Lying,
     #[error("the markers span a person of {size:.3} units, which is no human size in m, cm or mm; correct the file's unit of length")]
     Size { size: f64 },
-    #[error("no stretch of frames shows three markers of the pelvis where {set} puts them; correct the names or describe your set in markers.toml")]
+    #[error(
+        "no stretch of frames shows three markers of the pelvis where {set} puts them; correct the names or describe your set in markers.toml"
+    )]
     NoPelvis { set: String },
-    #[error("{percent:.0} % of the markers are farther than {LET_GO_M} m from a body that fits the others: left and right or other names are exchanged, or {set} is not the set used")]
+    #[error(
+        "{percent:.0} % of the markers are farther than {LET_GO_M} m from a body that fits the others: left and right or other names are exchanged, or {set} is not the set used"
+    )]
     NoBody { percent: f64, set: String },
 }
 
