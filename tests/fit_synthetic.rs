@@ -7,7 +7,7 @@ use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
 use muybridge::fit::state::{Carrier, State, Turns};
-use muybridge::fit::{FitOptions, Observation, fit};
+use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, resume};
 use muybridge::math::arrow::{LmOptions, minimise};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{Figure, SightOptions, joint_errors, sighting, staging};
@@ -75,21 +75,25 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
     let true_poses = poses(&truth, &curve);
     let (surface, offsets) = (Surface::new(&truth.shape), truth.shape.offsets());
     let group = &groups(&rig).unwrap()[0];
-    let options = SightOptions { step_px: 4, ..SightOptions::default() };
+    let sight = SightOptions { step_px: 4, ..SightOptions::default() };
     let observe = |(number, pose): (usize, &Pose)| {
         let figure = Figure::new(&surface, &offsets, &place(&offsets, pose));
-        let points = sighting::points(&figure, group, number, &options).into_iter();
+        let points = sighting::points(&figure, group, number, &sight).into_iter();
         let point = |(position, covariance)| CloudPoint { position, colour: [0; 3], confidence: 1.0, covariance };
         Observation {
             number,
             time_s: number as f64 / fps,
             cloud: Cloud { points: points.map(point).collect() },
-            masks: sighting::masks(&figure, &rig, number, &options).into_iter().map(Some).collect(),
+            masks: sighting::masks(&figure, &rig, number, &sight).into_iter().map(Some).collect(),
         }
     };
     let observations: Vec<Observation> = true_poses.par_iter().enumerate().map(observe).collect();
     let floor = true_poses.iter().map(|p| staging::lowest_m(&surface, &place(&offsets, p), rig.up)).fold(f64::INFINITY, f64::min);
-    let found = fit(&observations, &rig, &model, Some(floor), &FitOptions { components: 8, ..FitOptions::default() }, &|_| true).unwrap();
+    let options = FitOptions { components: 8, ..FitOptions::default() };
+    let kept = std::cell::RefCell::new(Vec::new());
+    let keep = |stage: usize, at: &Checkpoint| kept.borrow_mut().push((stage, at.clone()));
+    let watched = Checkpoints { load: &|_| None, save: &keep };
+    let found = resume(&observations, &rig, &model, Some(floor), &options, &watched, &|_| true).unwrap();
     let errors = joint_errors(&positions(&found.state, &found.poses), &positions(&truth, &true_poses));
     assert!(errors.absolute_m < 0.012 && errors.swapped_over_straight > 3.0, "{errors:?}");
     for (a, b) in found.state.carriers.iter().zip(&truth.carriers) {
@@ -97,6 +101,14 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
         assert!(apart.abs() < 0.02 && (a.position - b.position).norm() < 0.03, "{apart} {}", a.position - b.position);
         assert!(a.world_from_carrier.angle_to(&b.world_from_carrier) < 0.08);
     }
+    // Stopped late and taken up again, it ends as if nothing had been.
+    let kept = kept.into_inner();
+    let until = &kept[..kept.len() * 9 / 10];
+    let (last, more) = (|stage: usize| until.iter().rev().find(|k| k.0 == stage).map(|k| k.1.clone()), std::cell::Cell::new(0));
+    let again = Checkpoints { load: &last, save: &|_, _| more.set(more.get() + 1) };
+    let again = resume(&observations, &rig, &model, Some(floor), &options, &again, &|_| true).unwrap();
+    assert!(more.get() > 0 && more.get() < kept.len() / 5 + 1, "{} of {}", more.get(), kept.len());
+    assert_eq!(format!("{:?} {:?}", again.state, again.iterations), format!("{:?} {:?}", found.state, found.iterations));
     // One standard deviation each: a fit that says nothing would be off by 1.
     let off = |i: usize| (found.state.weights[i] - truth.weights[i]) / curve.eigenvalues[i].sqrt();
     let rms = ((0..8).map(|i| off(i).powi(2)).sum::<f64>() / 8.0).sqrt();

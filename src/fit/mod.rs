@@ -14,6 +14,7 @@ pub mod state;
 pub mod targets;
 pub mod uncertainty;
 pub mod weighing;
+pub mod whole_cycle;
 mod wrench;
 
 use std::sync::Arc;
@@ -136,31 +137,58 @@ const STYLED: Free = Free { weights: true, stature: true, widths: true, ..TURNED
 const SHAPED: Free = Free { lengths: true, ..STYLED };
 const POSED: Free = Free { posture: true, ..SHAPED };
 
+/// A stage of the fit between two of its rounds.
+#[derive(Clone, Debug)]
+pub struct Checkpoint {
+    /// Done in this stage.
+    pub rounds: usize,
+    /// Solver iterations in this stage.
+    pub iterations: u64,
+    /// At the beginning of the last round.
+    pub cost: f64,
+    pub state: State,
+}
+
+/// Where a fit that was stopped goes on, by the number of the stage. argmin's own checkpoints do not serve: weights are frozen
+/// anew for every iteration, so each of its runs is one iteration long.
+pub struct Checkpoints<'a> {
+    pub load: &'a dyn Fn(usize) -> Option<Checkpoint>,
+    pub save: &'a dyn Fn(usize, &Checkpoint),
+}
+
+impl Checkpoints<'_> {
+    pub const NONE: Checkpoints<'static> = Checkpoints { load: &|_| None, save: &|_, _| {} };
+}
+
 /// Everything one run needs beside the state.
 struct Run<'a> {
     model: &'a Model,
     known: Known,
     iterations: u64,
+    checkpoints: &'a Checkpoints<'a>,
+    /// Stages begun.
+    stages: usize,
 }
 
 impl Run<'_> {
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
     fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
         let settings = Settings { model_m: stage.model_m, phase_acceleration: stage.phase_acceleration, ..SETTINGS };
-        let mut state = state;
-        let mut previous = f64::INFINITY;
-        for _ in 0..stage.refreshes {
-            let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &state);
+        let begun = (self.checkpoints.load)(self.stages);
+        let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, cost: f64::INFINITY, state });
+        while at.rounds < stage.refreshes {
+            let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &at.state);
             let cost = total(&problem.fitness).cost;
-            if (previous - cost).abs() < 1e-3 * cost {
+            if (at.cost - cost).abs() < 1e-3 * cost {
                 break;
             }
-            previous = cost;
-            let (next, summary) = minimise(problem, state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
-            self.iterations += summary.iterations;
-            state = next;
+            let (state, summary) = minimise(problem, at.state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
+            at = Checkpoint { rounds: at.rounds + 1, iterations: at.iterations + summary.iterations, cost, state };
+            (self.checkpoints.save)(self.stages, &at);
         }
-        state
+        self.stages += 1;
+        self.iterations += at.iterations;
+        at.state
     }
 
     /// The rough stages, from the mean motion to ten weights, stature and widths.
@@ -183,6 +211,19 @@ pub fn fit(
     model: &Model,
     floor_m: Option<f64>,
     options: &FitOptions,
+    progress: &dyn Fn(f64) -> bool,
+) -> Result<Fit, FitError> {
+    resume(observations, rig, model, floor_m, options, &Checkpoints::NONE, progress)
+}
+
+/// [`fit`] with checkpoints, which must be of the same observations, rig, model and options.
+pub fn resume(
+    observations: &[Observation],
+    rig: &Rig,
+    model: &Model,
+    floor_m: Option<f64>,
+    options: &FitOptions,
+    checkpoints: &Checkpoints,
     progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
     if model.members.is_empty() {
@@ -210,7 +251,7 @@ pub fn fit(
     let mean = Curve::new(model, 0);
     let search = Settings { model_m: 0.06, ..SETTINGS };
     let found = start::hypotheses(&track, &sparse, &mean, model, &search, &known);
-    let mut run = Run { model, known, iterations: 0 };
+    let mut run = Run { model, known, iterations: 0, checkpoints, stages: 0 };
     step(0.1)?;
     let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
     let ten = Curve::new(model, 10);

@@ -15,15 +15,15 @@
 
 use std::sync::Arc;
 
-use nalgebra::{DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::curve::Curve;
 use super::state::{LOCAL, Layout, Motion, State};
 use super::weighing::{Fitness, Frozen, FrozenOutside, freeze, freeze_outsides, outside_px};
-use super::wrench::{FrameNormal, Gathered, Pull};
+use super::wrench::{FrameNormal, Gathered, Gradient, Pull};
 use crate::body::surface::{Evaluation, SKIN};
-use crate::body::{Joint, Length, PosedSurface, Surface};
+use crate::body::{Joint, Length, NODES, PosedSurface, Surface};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::distance_field::DistanceField;
 use crate::math::rotation::{hat, left_jacobian, log};
@@ -215,6 +215,35 @@ impl<'a> Problem<'a> {
             }
         }
         gathered.expand(&motion, state.layout(), self.moving(state.layout()))
+    }
+
+    /// Σ ω j over the residuals at the skin of each node: minus how the unknowns are pulled when a node's skin lies one
+    /// metre off in all frames. A row per unknown of the frames, then the shared ones; a column per node.
+    pub fn skin_pulls(&self, state: &State) -> DMatrix<f64> {
+        let surface = Surface::new(&state.shape);
+        let layout = state.layout();
+        let of_frame = |frame: usize| -> Vec<Vec<f64>> {
+            let motion = state.motion(self.curve, &surface, frame);
+            let mut scratch = Scratch::default();
+            let mut nodes = vec![Gradient::new(); NODES];
+            for frozen in self.frozen[frame].iter().filter(|f| f.weight > 0.0) {
+                let (_, factor) = Self::residual(&motion, state, frame, frozen, &mut scratch);
+                nodes[frozen.node as usize].add(frozen.weight * factor, &scratch.pull);
+            }
+            nodes.iter().map(|node| node.expand(&motion, layout, self.moving(layout))).collect()
+        };
+        let frames: Vec<_> = (0..self.frames.len()).into_par_iter().map(of_frame).collect();
+        let locals = layout.local * frames.len();
+        let mut pulls = DMatrix::zeros(locals + layout.shared(), NODES);
+        for (t, nodes) in frames.iter().enumerate() {
+            for (n, pull) in nodes.iter().enumerate() {
+                for (i, value) in pull.iter().enumerate() {
+                    let row = if i < layout.local { t * layout.local + i } else { locals + i - layout.local };
+                    pulls[(row, n)] += value;
+                }
+            }
+        }
+        pulls
     }
 
     /// How many of the unknowns can move a frame: the posture, last of them, is often pinned.
@@ -446,7 +475,7 @@ pub(super) mod tests {
     use crate::fit::state::Carrier;
     use crate::math::rotation::exp;
 
-    const SETTINGS: Settings = Settings {
+    pub const SETTINGS: Settings = Settings {
         model_m: 0.03,
         point_weight: 0.1,
         ray_weight: 0.1,
@@ -463,9 +492,9 @@ pub(super) mod tests {
         deviation: 0.1,
         turn_acceleration: 5.0,
     };
-    const KNOWN: Known =
+    pub const KNOWN: Known =
         Known { viewpoint: Vector3::new(0.1, 0.0, 1.0), up: Vector3::new(0.0, 0.0, 1.0), stature_m: 1.75, floor_m: Some(0.12) };
-    const ALL: Free = Free { rotation: true, phase: true, weights: true, stature: true, lengths: true, widths: true, posture: true };
+    pub const ALL: Free = Free { rotation: true, phase: true, weights: true, stature: true, lengths: true, widths: true, posture: true };
 
     pub fn state() -> State {
         let mut shape = Shape::template(1.7);
@@ -572,6 +601,45 @@ pub(super) mod tests {
                 assert!((numeric - analytic).abs() < 1e-6 * (1.0 + numeric.abs()), "unknown {i}: {numeric} against {analytic}");
             }
         }
+    }
+
+    #[test]
+    fn skin_that_is_off_pulls_as_points_that_are_moved() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let frames = frames(&curve, &state);
+        let mut problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
+        let (pulls, before) = (problem.skin_pulls(&state), problem.linearise(&state));
+        let node = problem.frozen.iter().flatten().max_by(|a, b| a.weight.total_cmp(&b.weight)).unwrap().node;
+        let (surface, off_m) = (Surface::new(&state.shape), 1e-6);
+        for t in 0..frames.len() {
+            let posed = state.posed(&curve, &surface, t).surface;
+            for frozen in problem.frozen[t].iter_mut().filter(|f| f.node == node) {
+                let mut evaluation = Evaluation::default();
+                posed.evaluate_among(&frozen.near, &frozen.x, &mut evaluation);
+                let slope = frozen.metres_per_root * evaluation.gradient * evaluation.root_slope();
+                // The distance grows by as much, and the force keeps its place in first order only where residuals are small.
+                frozen.x += slope * (off_m / slope.norm_squared());
+            }
+        }
+        let after = problem.linearise(&state);
+        let moved = |i: usize, locals: usize| {
+            if i < locals {
+                after.local_gradient[i] - before.local_gradient[i]
+            } else {
+                after.shared_gradient[i - locals] - before.shared_gradient[i - locals]
+            }
+        };
+        let locals = before.local_gradient.len();
+        let column = pulls.column(node as usize);
+        let numeric = DVector::from_fn(column.len(), |i, _| moved(i, locals) / off_m);
+        assert!(
+            column.norm() > 1.0 && (&numeric - column).norm() < 0.35 * column.norm(),
+            "{} of {}",
+            (&numeric - column).norm(),
+            column.norm()
+        );
     }
 
     #[test]

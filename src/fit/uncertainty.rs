@@ -7,22 +7,22 @@
 //! the factor at which the variance that the least-squares fit believes its scores to have equals the variance that
 //! they show (a cluster-robust "sandwich" with one factor per kind of residual); points and rays have one each. The
 //! misfit of the skin is what the residuals show beyond the points' own covariance. The priors enter as they are:
-//!   Σ = (Σ_kinds s Jᵀ W J + P)⁻¹.                                                                               (2)
+//!   Σ = (Σ_kinds s Jᵀ W J + P)⁻¹ + m² Σ_n g_n g_nᵀ.                                                             (2)
+//! The second term: a misfit m that stays with the skin of node n in all frames is averaged out by no number of them; g_n is
+//! how far it moves the solution (consider covariance; G. Bierman, Factorization methods, 1977).
 //! Of the inverse only the blocks of one frame and of the shared unknowns are formed (selected inversion), so time and
 //! memory are linear in the number of frames. A joint at x moves by J δ, hence its covariance is J Σ Jᵀ.
-//! A misfit that stays with a limb goes into its width: the width's variance gets (misfit / radius)² besides.
 //! What is not in it: joint centres of another convention, and motions that differ from all subjects of the database.
 //! Checked against the dense inverse, and by the coverage of its intervals over repeated noise.
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
 use super::curve::Curve;
 use super::problem::{Frame, Free, Known, Problem, Settings};
 use super::state::{LOCAL, Motion, State};
 use super::weighing::Frozen;
-use crate::body::surface::SKIN;
-use crate::body::{Length, NODES, Surface};
+use crate::body::{NODES, Surface};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::order::quantile;
 
@@ -49,8 +49,8 @@ pub struct Uncertainty {
 
 /// Fewer residuals than this say nothing about their own variance.
 const FEWEST: f64 = 100.0;
-/// Least misfit of any body model, metres.
-const LEAST_MISFIT_M: f64 = 0.002;
+/// Least misfit of any body model, metres: what the fit itself is off by on bodies of its own kind (`bench coverage`).
+const LEAST_MISFIT_M: f64 = 0.0015;
 
 /// Uncertainty at a solution found with `settings`; `None` where the equations are singular.
 pub fn uncertainty(curve: &Curve, frames: &[Frame], settings: &Settings, free: Free, known: &Known, state: &State) -> Option<Uncertainty> {
@@ -61,12 +61,8 @@ pub fn uncertainty(curve: &Curve, frames: &[Frame], settings: &Settings, free: F
         [true, false].map(|points| share(frozen.frozen().iter().map(|f| f.iter().filter(|f| f.is_point == points))))
     };
     let measured = Settings { point_weight: shares[0], ray_weight: shares[1], ..believed };
-    let normal = Problem::new(curve, frames, &measured, free, known, state).linearise(state);
-    let (mut shared, frames) = propagate(&normal, curve, state)?;
-    for (i, sigma) in width_misfits(&Surface::new(&state.shape), misfit_m).into_iter().enumerate().filter(|_| free.widths) {
-        let at = state.layout().stature() + 1 + Length::COUNT + i;
-        shared[(at, at)] += sigma * sigma;
-    }
+    let problem = Problem::new(curve, frames, &measured, free, known, state);
+    let (shared, frames) = propagate(&problem.linearise(state), &(problem.skin_pulls(state) * misfit_m), curve, state)?;
     Some(Uncertainty { shared, frames, shares, misfit_m })
 }
 
@@ -76,18 +72,6 @@ fn misfit_m(problem: &Problem) -> f64 {
     let median = |values: Vec<f64>| quantile(values, 0.5).unwrap_or(0.0);
     let spread = 1.4826 * median(points().map(|f| f.distance_m.abs()).collect());
     (spread * spread - median(points().map(|f| f.variance).collect())).max(0.0).sqrt().max(LEAST_MISFIT_M)
-}
-
-/// What a limb's width factor errs by when its skin is off by `misfit_m` in all frames alike: no number of frames averages
-/// that out, and the width takes up all of it.
-fn width_misfits(surface: &Surface, misfit_m: f64) -> [f64; Length::COUNT] {
-    let (mut radii_m, mut counts) = ([0.0; Length::COUNT], [0.0; Length::COUNT]);
-    for p in &surface.primitives {
-        let across = p.semi_axes.product() / p.semi_axes[p.axis];
-        radii_m[p.limb as usize] += (SKIN * across).sqrt();
-        counts[p.limb as usize] += 1.0;
-    }
-    std::array::from_fn(|i| if counts[i] > 0.0 { misfit_m * counts[i] / radii_m[i] } else { 0.0 })
 }
 
 /// Equation (1) over frames of residuals.
@@ -104,32 +88,44 @@ fn share<'a, F: Iterator<Item = &'a Frozen>>(frames: impl Iterator<Item = F>) ->
     if believed < FEWEST { 0.0 } else { (believed / shown.max(believed * 1e-3)).min(1.0) }
 }
 
-/// The covariance of the shared unknowns, and what follows for each frame.
-fn propagate(normal: &NormalEquations, curve: &Curve, state: &State) -> Option<(DMatrix<f64>, Vec<FrameUncertainty>)> {
+/// The covariance of the shared unknowns, and what follows for each frame; `pulls` are those of skin that is off.
+fn propagate(
+    normal: &NormalEquations,
+    pulls: &DMatrix<f64>,
+    curve: &Curve,
+    state: &State,
+) -> Option<(DMatrix<f64>, Vec<FrameUncertainty>)> {
     let factor = normal.local.cholesky()?;
     let eliminated = factor.solve(&normal.border);
     let shared = (&normal.shared - normal.border.tr_mul(&eliminated)).cholesky()?.inverse();
     let inverse = factor.selected_inverse();
+    let locals = eliminated.nrows();
+    // How the solution gives way to the pulls: shared unknowns, then the frames'.
+    let way_shared = &shared * (pulls.rows(locals, shared.nrows()) - eliminated.tr_mul(&pulls.rows(0, locals)));
+    let way = factor.solve(&pulls.rows(0, locals).into_owned()) - &eliminated * &way_shared;
     let surface = Surface::new(&state.shape);
     let layout = state.layout();
     let of_frame = |t: usize| {
         let first = t * layout.local;
         let block = DMatrix::from_fn(layout.local, layout.local, |i, j| inverse.get(first + i, first + j));
         let through = eliminated.rows(first, layout.local).into_owned();
-        let whole = &block + &through * &shared * through.transpose();
+        let own_way = way.rows(first, layout.local);
+        let whole = &block + &through * &shared * through.transpose() + own_way * own_way.transpose();
         let motion = state.motion(curve, &surface, t);
         let placement = state.posed(curve, &surface, t).placement;
         let joints_m = std::array::from_fn(|node| {
             let jacobian = position_jacobian(&motion, state, t, node, &placement.positions[node]);
             let local = jacobian.columns(0, layout.local);
-            let rest = jacobian.columns(layout.local, layout.shared()) - local * &through;
-            let covariance: Matrix3<f64> =
-                (local * &block * local.transpose() + &rest * &shared * rest.transpose()).fixed_view::<3, 3>(0, 0).into();
-            covariance.diagonal().map(|v| v.max(0.0).sqrt())
+            let (direct, moved) = (jacobian.columns(layout.local, layout.shared()), local * own_way);
+            let rest = direct - local * &through;
+            let moved = moved + direct * &way_shared;
+            let covariance = local * &block * local.transpose() + &rest * &shared * rest.transpose() + &moved * moved.transpose();
+            Vector3::from_fn(|axis, _| covariance[(axis, axis)].max(0.0).sqrt())
         });
         FrameUncertainty { local: std::array::from_fn(|i| whole[(i, i)].max(0.0).sqrt()), joints_m }
     };
     let frames = (0..state.carriers.len()).into_par_iter().map(of_frame).collect();
+    let shared = shared + &way_shared * way_shared.transpose();
     Some((shared, frames))
 }
 
@@ -150,7 +146,7 @@ fn position_jacobian(motion: &Motion, state: &State, frame: usize, node: usize, 
 mod tests {
     use super::*;
     use crate::fit::curve::tests::made_up_model;
-    use crate::fit::problem::tests::state;
+    use crate::fit::problem::tests::{ALL, KNOWN, SETTINGS, state};
 
     #[test]
     fn positions_move_as_their_jacobian_says() {
@@ -179,15 +175,43 @@ mod tests {
     }
 
     #[test]
-    fn width_takes_up_the_misfit_of_the_skin() {
-        let shape = crate::body::Shape::template(1.75);
-        let surface = Surface::new(&shape);
-        let found = width_misfits(&surface, 0.002);
-        // 2 mm on a thigh of about 7 cm and a forearm of about 4 cm radius.
-        let (thigh, forearm) = (found[Length::Thigh as usize], found[Length::Forearm as usize]);
-        assert!((0.02..0.045).contains(&thigh) && (0.035..0.08).contains(&forearm), "{thigh} {forearm}");
-        let wider = Surface::new(&crate::body::Shape { widths: [2.0; Length::COUNT], ..shape });
-        assert!((width_misfits(&wider, 0.002)[Length::Thigh as usize] * 2.0 / thigh - 1.0).abs() < 0.01);
+    fn covariances_are_those_of_the_dense_inverse() {
+        let curve = Curve::new(&made_up_model(3), 3);
+        let state = state();
+        let frames = crate::fit::problem::tests::frames(&curve, &state);
+        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
+        let (normal, pulls) = (problem.linearise(&state), problem.skin_pulls(&state) * 0.003);
+        let (shared, found) = propagate(&normal, &pulls, &curve, &state).unwrap();
+        let (locals, layout) = (normal.local_gradient.len(), state.layout());
+        let dense = DMatrix::from_fn(locals + layout.shared(), locals + layout.shared(), |i, j| match (i < locals, j < locals) {
+            (true, true) => normal.local.get(i.max(j), i.min(j)),
+            (true, false) => normal.border[(i, j - locals)],
+            (false, true) => normal.border[(j, i - locals)],
+            (false, false) => normal.shared[(i - locals, j - locals)],
+        });
+        let inverse = dense.try_inverse().unwrap();
+        let way = &inverse * &pulls;
+        let covariance = inverse + &way * way.transpose();
+        let scale = |i: usize, j: usize| (covariance[(i, i)] * covariance[(j, j)]).sqrt();
+        for i in 0..layout.shared() {
+            for j in 0..layout.shared() {
+                let (a, b) = (locals + i, locals + j);
+                assert!((shared[(i, j)] - covariance[(a, b)]).abs() < 1e-6 * scale(a, b), "{i} {j}");
+            }
+        }
+        let surface = Surface::new(&state.shape);
+        for (t, frame) in found.iter().enumerate() {
+            for k in 0..LOCAL {
+                let at = layout.local * t + k;
+                assert!((frame.local[k] / covariance[(at, at)].sqrt() - 1.0).abs() < 1e-6, "{t} {k}");
+            }
+            let (motion, x) = (state.motion(&curve, &surface, t), state.posed(&curve, &surface, t).placement.positions);
+            let own: Vec<usize> = (0..layout.local).map(|k| layout.local * t + k).chain(locals..locals + layout.shared()).collect();
+            let block = DMatrix::from_fn(own.len(), own.len(), |i, j| covariance[(own[i], own[j])]);
+            let jacobian = position_jacobian(&motion, &state, t, 12, &x[12]);
+            let expected = &jacobian * block * jacobian.transpose();
+            assert!((0..3).all(|axis| (frame.joints_m[12][axis] / expected[(axis, axis)].sqrt() - 1.0).abs() < 1e-6));
+        }
     }
 
     #[test]

@@ -60,11 +60,39 @@ impl Pull {
     }
 }
 
+/// Sum of ω r j over wrenches and sizes.
+#[derive(Clone)]
+pub(super) struct Gradient {
+    nodes: [[f64; 6]; NODES],
+    sizes: [f64; SIZES],
+}
+
+impl Gradient {
+    pub fn new() -> Gradient {
+        Gradient { nodes: [[0.0; 6]; NODES], sizes: [0.0; SIZES] }
+    }
+
+    /// Adds `scale` times the pull.
+    pub fn add(&mut self, scale: f64, pull: &Pull) {
+        pull.nodes[..pull.count].iter().for_each(|(node, wrench)| add_scaled(&mut self.nodes[*node], scale, wrench));
+        pull.sizes.iter().for_each(|(size, value)| self.sizes[*size] += scale * value);
+    }
+
+    /// The same over the first `size` unknowns.
+    pub fn expand(&self, motion: &Motion, layout: Layout, size: usize) -> Vec<f64> {
+        let mut sum = vec![0.0; size];
+        for (wrench, twist) in self.nodes.iter().zip(&motion.twists).filter(|(wrench, _)| **wrench != [0.0; 6]) {
+            wrench.iter().enumerate().for_each(|(r, w)| add_scaled(&mut sum, *w, twist.row(r)));
+        }
+        add_scaled(&mut sum[layout.local + layout.stature()..], 1.0, &self.sizes);
+        sum
+    }
+}
+
 /// Half the sum of ω r², its gradient and Gauss–Newton Hessian over wrenches and sizes.
 pub(super) struct Gathered {
     cost: f64,
-    gradient: [[f64; 6]; NODES],
-    size_gradient: [f64; SIZES],
+    gradient: Gradient,
     /// Blocks of nodes i ≥ j at [`pair`]; rows are those of i.
     blocks: Vec<[[f64; 6]; 6]>,
     /// Sizes against wrenches, and against sizes.
@@ -82,8 +110,7 @@ impl Gathered {
     pub fn new() -> Gathered {
         Gathered {
             cost: 0.0,
-            gradient: [[0.0; 6]; NODES],
-            size_gradient: [0.0; SIZES],
+            gradient: Gradient::new(),
             blocks: vec![[[0.0; 6]; 6]; PAIRS],
             size_nodes: vec![[[0.0; 6]; NODES]; SIZES],
             size_sizes: [[0.0; SIZES]; SIZES],
@@ -95,10 +122,10 @@ impl Gathered {
     pub fn add(&mut self, residual: f64, weight: f64, factor: f64, pull: &mut Pull) {
         pull.scale(factor);
         self.cost += 0.5 * weight * residual * residual;
+        self.gradient.add(weight * residual, pull);
         let nodes = &mut pull.nodes[..pull.count];
         nodes.sort_unstable_by_key(|n| n.0);
         for (i, (a, of_a)) in nodes.iter().enumerate() {
-            add_scaled(&mut self.gradient[*a], weight * residual, of_a);
             for (b, of_b) in &nodes[..=i] {
                 self.met[*a] |= 1 << b;
                 let block = &mut self.blocks[pair(*a, *b)];
@@ -107,7 +134,6 @@ impl Gathered {
         }
         for (a, value) in &pull.sizes {
             let scaled = weight * value;
-            self.size_gradient[*a] += residual * scaled;
             let of_nodes = &mut self.size_nodes[*a];
             nodes.iter().for_each(|(b, of_b)| add_scaled(&mut of_nodes[*b], scaled, of_b));
             let of_sizes = &mut self.size_sizes[*a];
@@ -134,7 +160,8 @@ impl Gathered {
     #[inline(always)]
     fn expand_with(&self, motion: &Motion, layout: Layout, size: usize) -> FrameNormal {
         let first_size = layout.local + layout.stature();
-        let mut normal = FrameNormal { cost: self.cost, hessian: vec![0.0; size * size], gradient: vec![0.0; size] };
+        let mut normal =
+            FrameNormal { cost: self.cost, hessian: vec![0.0; size * size], gradient: self.gradient.expand(motion, layout, size) };
         let mut product = vec![0.0; 6 * size];
         let met = |i: usize, j: usize| self.met[i.max(j)] & (1 << i.min(j)) != 0;
         for (i, twist) in motion.twists.iter().enumerate().filter(|(i, _)| met(*i, *i)) {
@@ -146,7 +173,6 @@ impl Gathered {
             }
             for (r, row) in product.chunks_exact_mut(size).enumerate() {
                 row[first_size..].iter_mut().zip(&self.size_nodes).for_each(|(p, of_nodes)| *p += of_nodes[i][r]);
-                add_scaled(&mut normal.gradient, self.gradient[i][r], twist.row(r));
             }
             for (a, row) in normal.hessian.chunks_exact_mut(size).enumerate() {
                 let factors: [f64; 6] = std::array::from_fn(|r| twist.row(r)[a]);
@@ -157,7 +183,6 @@ impl Gathered {
         }
         for d in 0..SIZES {
             let a = first_size + d;
-            normal.gradient[a] += self.size_gradient[d];
             let row = &mut normal.hessian[a * size..=a * size + a];
             for (pairs, twist) in self.size_nodes[d].iter().zip(&motion.twists).filter(|(pairs, _)| **pairs != [0.0; 6]) {
                 add_six(row, pairs, std::array::from_fn(|r| &twist.row(r)[..=a]));

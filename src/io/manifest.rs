@@ -9,6 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::is_motion_file;
+use super::outputs_json::Outputs;
 use crate::motion_model::Activity;
 
 const MANIFEST: &str = "subjects.csv";
@@ -74,8 +75,11 @@ fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -
     let mut children: Vec<PathBuf> = fs::read_dir(path).map_err(failed)?.filter_map(|e| Some(e.ok()?.path())).collect();
     children.sort_by(|a, b| natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then(a.cmp(b)));
     let twin = |child: &Path| is_kind(child, "trc") && children.iter().any(|c| is_kind(c, "c3d") && c.file_stem() == child.file_stem());
+    // What this software wrote stands there in several formats: one of them is enough.
+    let written = Outputs::of_folder(path);
+    let is_copy = |child: &Path| child.file_name().is_some_and(|name| written.is_copy(&name.to_string_lossy()));
     for child in &children {
-        if child.is_dir() || is_motion_file(child) && !twin(child) {
+        if child.is_dir() || is_motion_file(child) && !twin(child) && !is_copy(child) {
             search(child, entries, seen)?;
         }
     }

@@ -3,6 +3,7 @@
 pub mod cadence;
 pub mod cycle;
 pub mod database;
+pub mod gait;
 pub mod markers;
 pub mod model;
 pub mod segment;
@@ -10,5 +11,6 @@ pub mod synthetic;
 
 pub use cadence::CadenceLaw;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
-pub use model::{Member, Model, ModelError};
+pub use gait::{Gait, gait};
+pub use model::{Detail, Member, Model, ModelError};
 pub use segment::{Label, Segments, segment};

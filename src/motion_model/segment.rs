@@ -113,21 +113,21 @@ pub fn segment(clip: &Clip, label: &Label) -> Result<Segments, SegmentError> {
 }
 
 /// A clip's poses with the positions that events are read from.
-struct Track {
-    fps: f64,
+pub(super) struct Track {
+    pub fps: f64,
     hip_height_m: f64,
     /// Length of the straight leg from hip joint to ankle, metres.
     leg_m: f64,
     /// Time of the first frame in the clip, seconds.
     start_s: f64,
-    poses: Vec<Pose>,
+    pub poses: Vec<Pose>,
     /// Right and left heel, right and left ankle.
-    heels: [Vec<Vector3<f64>>; 2],
+    pub heels: [Vec<Vector3<f64>>; 2],
     ankles: [Vec<Vector3<f64>>; 2],
 }
 
 impl Track {
-    fn new(clip: &Clip, frames: Range<usize>) -> Track {
+    pub fn new(clip: &Clip, frames: Range<usize>) -> Track {
         let poses = clip.poses[frames.clone()].to_vec();
         let heel = Vector3::new(0.0, HEEL.1, HEEL.0) * clip.hip_height_m;
         let mut track = Track {
@@ -154,7 +154,7 @@ impl Track {
     }
 
     /// Pose between frames, `at` in frames; the ends are clamped.
-    fn pose_at(&self, at: f64) -> Pose {
+    pub fn pose_at(&self, at: f64) -> Pose {
         let i = (at.max(0.0) as usize).min(self.poses.len() - 2);
         let part = (at - i as f64).clamp(0.0, 1.0);
         let (a, b) = (&self.poses[i], &self.poses[i + 1]);
@@ -198,7 +198,7 @@ fn facing(pose: &Pose) -> Vector2<f64> {
     ground(&(pose.world_from_root * Vector3::z())).try_normalize(1e-9).unwrap_or(Vector2::y())
 }
 
-fn ground(v: &Vector3<f64>) -> Vector2<f64> {
+pub(super) fn ground(v: &Vector3<f64>) -> Vector2<f64> {
     Vector2::new(v.x, v.z)
 }
 
@@ -240,7 +240,7 @@ struct Stride {
 /// The strides between right strikes, or where the clip holds more of them those between left strikes; without any of these
 /// the strides from one farthest place behind to the next, which short recordings of a single stride need.
 fn strides(track: &Track) -> Result<Vec<Stride>, SegmentError> {
-    let ahead = [0, 1].map(|side| ahead(track, side));
+    let ahead = [0, 1].map(|side| ahead(track, &track.heels[side]));
     let behind = ahead.each_ref().map(|a| maxima(&a.iter().map(|x| -x).collect::<Vec<_>>()));
     let [right, left] = ahead.map(|a| maxima(&a));
     let of_right: Vec<Stride> = right.windows(2).map(|w| Stride { from: w[0], to: w[1], right_strike: 0.0 }).collect();
@@ -266,15 +266,26 @@ fn travel_speed(track: &Track) -> f64 {
     quantile(speeds, 0.5).unwrap_or(0.0)
 }
 
-/// How far the right (0) or left (1) heel is ahead of the root, metres per frame; its maxima are the strikes.
-fn ahead(track: &Track, side: usize) -> Vec<f64> {
+/// Heel strikes of the right (0) or left (1) foot in frames, with fractions.
+pub(super) fn strikes(track: &Track, side: usize) -> Vec<f64> {
+    maxima(&ahead(track, &track.heels[side]))
+}
+
+/// Frames, with fractions, at which a point of the foot is farthest behind the root (Zeni's toe-off, of a toe's tip).
+pub(super) fn farthest_behind(track: &Track, points: &[Vector3<f64>]) -> Vec<f64> {
+    let behind: Vec<f64> = ahead(track, points).iter().map(|x| -x).collect();
+    maxima(&behind)
+}
+
+/// How far a point is ahead of the root along the heading of the second around, smoothed, metres.
+fn ahead(track: &Track, points: &[Vector3<f64>]) -> Vec<f64> {
     let facings: Vec<Vector2<f64>> = track.poses.iter().map(facing).collect();
     let half = track.frames(0.5);
     let ahead: Vec<f64> = (0..facings.len())
         .map(|i| {
             let heading: Vector2<f64> = facings[i.saturating_sub(half)..(i + half + 1).min(facings.len())].iter().sum();
             let heading = heading.try_normalize(1e-9).unwrap_or(facings[i]);
-            heading.dot(&ground(&(track.heels[side][i] - track.poses[i].root)))
+            heading.dot(&ground(&(points[i] - track.poses[i].root)))
         })
         .collect();
     smooth(&ahead, SMOOTH_S * track.fps)

@@ -6,6 +6,7 @@ use opencv::imgproc;
 
 use super::ReportError;
 use super::canvas::{Align, Canvas, Colour, INK, WHITE, tick_label, ticks};
+use crate::math::order::quantile;
 
 /// Where there is no value.
 const NOTHING: Colour = [214, 214, 214];
@@ -46,6 +47,25 @@ pub fn depth_map(values: &ImageBuffer<Luma<f32>, Vec<f32>>, range: (f64, f64), t
     Ok(canvas.picture)
 }
 
+/// Room around the person in a depth picture, px.
+const MARGIN_PX: u32 = 60;
+
+/// Where a map of depths in metres has values, twice as large, from the first to the last hundredth of the values.
+pub fn person_depth(depth: &ImageBuffer<Luma<f32>, Vec<f32>>, title: &str) -> Result<RgbImage, ReportError> {
+    let values = || depth.enumerate_pixels().filter(|(_, _, d)| d.0[0].is_finite());
+    let bounds = |at: fn((u32, u32)) -> u32, size: u32| {
+        let (low, high) = values().map(|(x, y, _)| at((x, y))).fold((size, 0), |(low, high), v| (low.min(v), high.max(v)));
+        (low.saturating_sub(MARGIN_PX), (high + MARGIN_PX).min(size))
+    };
+    let ((left, right), (top, bottom)) = (bounds(|p| p.0, depth.width()), bounds(|p| p.1, depth.height()));
+    let (width, height) = (right.saturating_sub(left).max(1), bottom.saturating_sub(top).max(1));
+    let inside = |x: u32, y: u32| depth.get_pixel_checked(left + x / 2, top + y / 2).copied().unwrap_or(Luma([f32::NAN]));
+    let large = ImageBuffer::from_fn(2 * width, 2 * height, inside);
+    let sorted: Vec<f64> = values().map(|(_, _, d)| f64::from(d.0[0])).collect();
+    let at = |part: f64| quantile(sorted.clone(), part).unwrap_or(1.0);
+    depth_map(&large, (at(0.01), at(0.99)), title, "m")
+}
+
 /// The 256 colours of viridis: even steps of lightness, also for colour-blind readers and in black and white.
 fn viridis() -> Result<Vec<Colour>, ReportError> {
     let ramp: Vec<u8> = (0..=255).collect();
@@ -73,5 +93,15 @@ mod tests {
             assert!(found.iter().zip(expected).all(|(a, b): (&u8, i32)| (i32::from(*a) - b).abs() <= 2), "{found:?} {expected:?}");
         }
         assert_eq!((at(11, 10), at(12, 10)), (NOTHING, NOTHING));
+    }
+
+    #[test]
+    fn the_person_alone_is_shown() {
+        let mut depth = ImageBuffer::from_pixel(640, 480, Luma([f32::NAN]));
+        assert!(person_depth(&depth, "t").is_ok());
+        (0..100).for_each(|y| (0..40).for_each(|x| depth.put_pixel(300 + x, 150 + y, Luma([2.0 + 0.01 * y as f32]))));
+        let picture = person_depth(&depth, "t").unwrap();
+        // 39 + 120 by 99 + 120 px, twice, with title and bar.
+        assert_eq!(picture.dimensions(), (2 * 159 + 162, 2 * 219 + 56));
     }
 }

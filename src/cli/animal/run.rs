@@ -77,7 +77,14 @@ pub fn run(args: &RunArgs) -> Result<()> {
             chosen.join("template.glb").display()
         ),
     }
-    page::write(&output, &name)?;
+    let source = [("video", &study.video), ("masks", &study.masks), ("strokes", &study.strokes)];
+    let mut facts: Vec<(&str, String)> =
+        source.iter().filter_map(|(what, path)| Some((*what, path.as_ref()?.display().to_string()))).collect();
+    facts.extend([("[silhouettes]", json(&study.silhouettes)?), ("[analyse]", json(&study.analyse)?), ("[keys]", json(&study.keys)?)]);
+    if let Some(animate) = &study.animate {
+        facts.push(("[animate]", json(animate)?));
+    }
+    page::write(&output, &name, &facts)?;
     println!("report: {}", output.join("report.html").display());
     Ok(())
 }

@@ -9,7 +9,6 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, bail, ensure};
 use muybridge::body::{Clip, Pose};
-use muybridge::clouds::{CloudRig, FrameCloud};
 use muybridge::fit::FitOptions;
 use muybridge::io::ply::write_ply;
 use muybridge::io::session::Session;
@@ -17,15 +16,15 @@ use muybridge::io::{bvh, calib_toml, write_atomic};
 use muybridge::motion::{Length, Synthesis, play, play_cycle, synthesize};
 use muybridge::motion_model::synthetic::{self, SyntheticSubject};
 use muybridge::motion_model::{Activity, Cycle};
-use muybridge::phantom::{DepthMap, Scene, Stage, staging};
+use muybridge::phantom::{Scene, Stage, staging};
 use muybridge::rig::Rig;
-use muybridge::style::{Metric, Population, Style};
+use muybridge::style::{Method, Population, Style};
 use tempfile::TempDir;
 
 use super::check;
-use super::model::default_variance;
 use super::render::{Take, write_session};
 use super::track::{self, NamedModel, Tracked};
+use super::track_report;
 use super::whole;
 
 /// A person the embedded database (seeds 1 to 9) does not hold.
@@ -104,24 +103,20 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
     let (session, _) = Session::open(&session_folder, None)?;
     clock.time("check", || announce(&session))?;
     let model = clock.time("model", || NamedModel::synthetic(Activity::Walking))?;
-    let mut depth = None;
     let seen = clock.time("clouds", || {
-        track::look(&session, |rig, frame, found| {
+        track::look(&session, None, |_, frame, found| {
             if frame.number.is_multiple_of(CLOUD_EVERY) {
                 write_ply(&folder.join(format!("clouds/{:06}.ply", frame.number)), &found.cloud)?;
-            }
-            if frame.number == frames / 2 {
-                depth = depth_of(rig, found);
             }
             Ok(())
         })
     })?;
-    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default()))?;
+    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default(), None))?;
     let generated = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
     let rows = clock.time("errors and pictures", || {
         let rows = errors::rows(&truth, &model, &tracked, &generated)?;
         track::draw(&folder.join("pictures"), &session.rig, &model, &tracked)?;
-        pictures::draw(&folder.join("pictures"), &truth, &model, &tracked, &generated, depth.as_ref())?;
+        pictures::draw(&folder.join("pictures"), &truth, &model, &tracked, &generated, tracked.depth.as_ref().map(|d| &d.1))?;
         Ok(rows)
     })?;
     let text = table::text(&rows, errors::NOTES, &clock.0);
@@ -158,17 +153,10 @@ fn announce(session: &Session) -> Result<()> {
     Ok(())
 }
 
-/// Depths in the reference view, metres.
-fn depth_of(rig: &CloudRig, found: &FrameCloud) -> Option<DepthMap> {
-    let (rectification, _) = rig.groups.first()?;
-    let mut map = found.disparity.clone();
-    map.pixels_mut().for_each(|d| d.0[0] = if d.0[0] > 0.0 { rectification.depth(d.0[0].into()) as f32 } else { f32::NAN });
-    Some(map)
-}
-
 /// Writes what `track` and `generate` write.
 fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<Vec<Generated>> {
     track::write(&folder.join("track"), session, model, tracked)?;
+    track_report::write(&folder.join("track"), session, model, tracked)?;
     let style = track::style(&tracked.fit, model);
     let offsets = tracked.fit.shape().offsets();
     let one = |kmh: f64| {
@@ -182,9 +170,8 @@ fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Trac
 
 /// As `muybridge generate` does it without options.
 fn at_speed(model: &NamedModel, style: &Style, speed_m_s: f64) -> Result<Synthesis> {
-    let wanted = model.model.components(default_variance(Activity::Walking));
-    let population = Population::new(&model.model, wanted.min(style.weights.len()));
-    Ok(synthesize(&model.model, &population, Metric::Paper, style, speed_m_s, style.hip_height_m)?)
+    let population = Population::new(&model.model, style.weights.len());
+    Ok(synthesize(&model.model, &population, Method::Default, style, speed_m_s, style.hip_height_m)?)
 }
 
 fn marker(truth: &Truth) -> String {
@@ -229,6 +216,7 @@ fn where_to_look(output: &Path) {
         ("pictures/angles.png", "recovered and true joint angles over the cycle"),
         ("pictures/speeds.png", "the same person at five speeds"),
         ("generated/*.bvh", "the five motions, for Blender and others"),
+        ("track/report.html", "all of it on one page, with gait table and a view to turn about"),
         ("track/motion.bvh", "the recovered motion; joints.csv and style.json beside it"),
         ("clouds/*.ply", "point clouds, for MeshLab and others"),
         ("session/", "the footage with its truth, a session for `muybridge check`, `clouds` and `track`"),
