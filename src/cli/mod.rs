@@ -15,6 +15,7 @@ mod model;
 mod motions;
 mod observe;
 mod outputs;
+mod profile;
 mod progress;
 mod render;
 mod rig;

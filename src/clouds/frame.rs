@@ -327,13 +327,7 @@ fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], region: Region, dispa
     }
 }
 
-fn points(
-    rectification: &Rectification,
-    reference: &StereoView,
-    refined: &Refined,
-    region: Region,
-    options: &CloudOptions,
-) -> Cloud {
+fn points(rectification: &Rectification, reference: &StereoView, refined: &Refined, region: Region, options: &CloudOptions) -> Cloud {
     let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, refined, region.corner(), &reference.plane));
     match options.voxel_m {
         Some(side) => tidy::thin(cloud, side),

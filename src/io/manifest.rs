@@ -95,7 +95,14 @@ const KINDS: [&str; 16] =
     ["dynamic", "static", "ik", "expdata", "markers", "mocap", "trials", "data", "raw", "c3d", "trc", "mot", "bvh", "amc", "walk", "run"];
 
 fn plain(path: &Path) -> Entry {
-    Entry { path: path.to_path_buf(), subject: subject_of(path).unwrap_or_default(), activity: None, parameter: None, start_s: None, end_s: None }
+    Entry {
+        path: path.to_path_buf(),
+        subject: subject_of(path).unwrap_or_default(),
+        activity: None,
+        parameter: None,
+        start_s: None,
+        end_s: None,
+    }
 }
 
 /// The nearest folder's name that can be a person's.

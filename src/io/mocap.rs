@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use super::asf_amc::{self, AsfAmcError};
 use super::bvh::{self, BvhError};
-use super::markers::{self, MarkersError};
 use super::mapping::{MappingError, Recording, clip_from_recording};
+use super::markers::{self, MarkersError};
 use super::mot::{self, MotError};
 use super::sidecar::Sidecar;
 use crate::body::Clip;

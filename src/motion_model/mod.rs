@@ -3,8 +3,8 @@
 pub mod cadence;
 pub mod cycle;
 pub mod database;
-pub mod markers;
 pub mod gait;
+pub mod markers;
 pub mod model;
 pub mod segment;
 pub mod synthetic;
@@ -12,5 +12,5 @@ pub mod synthetic;
 pub use cadence::CadenceLaw;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
 pub use gait::{Gait, gait};
-pub use model::{Member, Model, ModelError};
+pub use model::{Detail, Member, Model, ModelError};
 pub use segment::{Label, Segments, segment};

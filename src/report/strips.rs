@@ -8,12 +8,13 @@
 use nalgebra::Vector3;
 
 use super::ReportError;
-use super::canvas::{Align, Colour, GRID, INK, LEFT, Pen, RIGHT, skeleton_marks};
+use super::canvas::{Align, Colour, GRID, INK, LEFT, Pen, RIGHT, skeleton_marks, text_width_px};
 use super::figures::forward;
 use super::marks::{Drawing, Mark};
 use crate::body::{Clip, NODES};
 
 const PX_PER_M: f64 = 130.0;
+/// Least width of the labels' column.
 const LABEL_PX: f64 = 200.0;
 const HEAD_PX: f64 = 44.0;
 /// Angle between the view and the walking direction, radians.
@@ -57,18 +58,22 @@ pub fn strips(rows: &[Strip], figures: usize, view: f64) -> Result<Drawing, Repo
     let reach = points().map(|p| p[0].abs()).fold(0.3, f64::max);
     // The head's circle stands above its joint.
     let tall = points().map(|p| p[1]).fold(1.0, f64::max) + 0.17;
+    let mut label_px = LABEL_PX;
+    for row in rows {
+        label_px = label_px.max(text_width_px(&row.label, 12.0)? + 34.0);
+    }
     let place_px = 1.75 * reach * PX_PER_M;
     let row_px = tall * PX_PER_M + 26.0;
-    let size = [LABEL_PX + figures as f64 * place_px + 20.0, HEAD_PX + rows.len() as f64 * row_px + 34.0];
-    let mut marks = legend(rows.iter().any(|r| r.recorded.is_some()));
+    let size = [label_px + figures as f64 * place_px + 20.0, HEAD_PX + rows.len() as f64 * row_px + 34.0];
+    let mut marks = legend(rows.iter().any(|r| r.recorded.is_some()), label_px);
     for (i, (row, (made, recorded))) in rows.iter().zip(&all).enumerate() {
         let floor_px = HEAD_PX + (i + 1) as f64 * row_px - 12.0;
-        marks.push(Mark::Line { from: [LABEL_PX, floor_px], to: [size[0] - 16.0, floor_px], colour: GRID, width_px: 2 });
+        marks.push(Mark::Line { from: [label_px, floor_px], to: [size[0] - 16.0, floor_px], colour: GRID, width_px: 2 });
         let label =
             Mark::Text { at: [14.0, floor_px - 0.5 * row_px], text: row.label.clone(), capital_px: 12.0, colour: INK, align: Align::Left };
         marks.push(label);
         let place = |figure: &Figure, k: usize| {
-            let middle = LABEL_PX + (k as f64 + 0.5) * place_px;
+            let middle = label_px + (k as f64 + 0.5) * place_px;
             figure.map(|p| Some([middle + p[0] * PX_PER_M, floor_px - p[1] * PX_PER_M]))
         };
         let made_pen = Pen { width_px: 2, middle: INK, fade: 0.0, rim: None };
@@ -81,8 +86,9 @@ pub fn strips(rows: &[Strip], figures: usize, view: f64) -> Result<Drawing, Repo
     }
     let under = size[1] - 14.0;
     let cyclic = rows.iter().all(|r| r.cyclic);
+    marks.push(Mark::Text { at: [14.0, under], text: "phase".into(), capital_px: 9.0, colour: INK, align: Align::Left });
     for k in 0..figures {
-        let at = [LABEL_PX + (k as f64 + 0.5) * place_px, under];
+        let at = [label_px + (k as f64 + 0.5) * place_px, under];
         let text = format!("{:.0} %", 100.0 * phase(k, figures, cyclic));
         marks.push(Mark::Text { at, text, capital_px: 9.0, colour: INK, align: Align::Centre });
     }
@@ -115,13 +121,13 @@ fn instants(motion: &Phases, figures: usize, cyclic: bool, view: f64) -> Vec<Fig
     (0..figures).filter_map(at).collect()
 }
 
-fn legend(recorded: bool) -> Vec<Mark> {
+fn legend(recorded: bool, label_px: f64) -> Vec<Mark> {
     let mut entries = vec![("left", LEFT, 3), ("right", RIGHT, 3)];
     if recorded {
         entries.push(("recorded", super::canvas::faded(UNDER, 0.35), 6));
     }
     let entry = |(k, (name, colour, width_px)): (usize, (&str, Colour, i32))| {
-        let x = LABEL_PX + 120.0 * k as f64;
+        let x = label_px + 120.0 * k as f64;
         [
             Mark::Line { from: [x, 22.0], to: [x + 28.0, 22.0], colour, width_px },
             Mark::Text { at: [x + 36.0, 27.0], text: name.into(), capital_px: 10.0, colour: INK, align: Align::Left },

@@ -37,10 +37,10 @@ enum Timing {
 
 #[derive(Args)]
 pub struct BuildArgs {
-    /// Motion files (.bvh, .amc, .mot) or folders, searched to the bottom
+    /// Motion files (.bvh, .amc, .mot, .c3d, .trc) or folders, searched to the bottom
     #[arg(required = true, value_name = "MOTIONS")]
     inputs: Vec<PathBuf>,
-    /// Table of attributes: a column `file`, the others numbers; right-hand-height and energy are measured without it
+    /// Table of attributes: a column `file`, the others numbers; hand-height (the right one) and energy are measured without it
     #[arg(long, value_name = "FILE")]
     labels: Option<PathBuf>,
     /// Table of the files: file,subject,activity,speed_m_s or length_m,start_s,end_s
@@ -55,7 +55,7 @@ pub struct BuildArgs {
     #[arg(long, default_value = "common")]
     timing: Timing,
     /// Intervals between knots of the reference; 100 for cycles and jumps, 30 a second for whole clips
-    #[arg(long, value_parser = clap::value_parser!(u16).range(8..=2000))]
+    #[arg(long, value_parser = clap::value_parser!(u16).range(8..=1000))]
     knots: Option<u16>,
     /// Motion to warp the others to, by name; the one nearest to all without it
     #[arg(long, value_name = "NAME")]
@@ -84,7 +84,7 @@ pub fn run(args: &BuildArgs) -> Result<()> {
         );
     }
     let longest_s = examples.iter().map(|e| e.duration_s).fold(0.0, f64::max);
-    let of_time = activity.is_none().then(|| ((longest_s * KNOTS_PER_S).ceil() as usize).clamp(8, 2000));
+    let of_time = activity.is_none().then(|| ((longest_s * KNOTS_PER_S).ceil() as usize).clamp(8, 1000));
     let options = Options {
         activity,
         intervals: args.knots.map(usize::from).or(of_time),

@@ -45,7 +45,7 @@ pub fn run(args: &InfoArgs) -> Result<()> {
 /// The mean, and the mean with each of the first eigenmotions of shape taken off and added.
 fn eigenmotions(space: &Space) -> Vec<Made> {
     let of = |k: usize, amount: f64| {
-        let label = format!("mean {} {} s.d. of {}", if amount < 0.0 { "-" } else { "+" }, amount.abs(), k + 1);
+        let label = format!("mean {} {} s.d. of e{}", if amount < 0.0 { "-" } else { "+" }, amount.abs(), k + 1);
         eigenmotion(space, Some(k), None, amount).map(|v| made("", label, v))
     };
     let pairs = (0..SHOWN).flat_map(|k| [of(k, -AMOUNT), of(k, AMOUNT)]).flatten();
@@ -85,12 +85,32 @@ pub fn description(path: &Path, space: &Space) -> String {
         let (mean, deviation, labelled) = spread(attribute);
         let _ = writeln!(text, "  attribute {}: {labelled} labels, mean {mean:.3}, standard deviation {deviation:.3}", attribute.name);
     }
-    for member in &space.members {
-        let (degrees, seconds) = space.distance_from_mean(&member.vectors);
-        let duration_s = space.play(&member.vectors).duration_s();
-        let _ = writeln!(text, "  {}: {duration_s:.2} s, from the mean {degrees:.1} degrees and {seconds:.3} s", member.name);
+    for (name, members) in by_file(space) {
+        let each =
+            |f: &dyn Fn(usize) -> f64| members.iter().map(|&m| f(m)).fold((f64::MAX, f64::MIN), |(lo, hi), v| (lo.min(v), hi.max(v)));
+        let (fast, slow) = each(&|m| space.play(&space.members[m].vectors).duration_s());
+        let (near, far) = each(&|m| space.distance_from_mean(&space.members[m].vectors).0);
+        let count = members.len();
+        let _ = if count == 1 {
+            writeln!(text, "  {name}: {fast:.2} s, {near:.1} degrees from the mean")
+        } else {
+            writeln!(text, "  {name}: {count} motions of {fast:.2} to {slow:.2} s, {near:.1} to {far:.1} degrees from the mean")
+        };
     }
     text
+}
+
+/// Members of each file, whose names differ by their number only.
+fn by_file(space: &Space) -> Vec<(&str, Vec<usize>)> {
+    let mut files: Vec<(&str, Vec<usize>)> = Vec::new();
+    for (i, member) in space.members.iter().enumerate() {
+        let name = member.name.rsplit_once('#').map_or(member.name.as_str(), |(file, _)| file);
+        match files.last_mut().filter(|f| f.0 == name) {
+            Some((_, members)) => members.push(i),
+            None => files.push((name, vec![i])),
+        }
+    }
+    files
 }
 
 fn variance(pca: &Pca) -> String {
@@ -98,9 +118,9 @@ fn variance(pca: &Pca) -> String {
     if total <= 0.0 {
         return "all alike".into();
     }
-    let parts: Vec<String> = pca.eigenvalues.iter().take(5).map(|l| format!("{:.0} %", 100.0 * l / total)).collect();
+    let parts: Vec<String> = pca.eigenvalues.iter().take(5).map(|l| format!("{:.0}", 100.0 * l / total)).collect();
     let counts = [0.90, 0.95].map(|v| format!("{} eigenmotions hold {v:.2}", components(&pca.eigenvalues, v))).join(", ");
-    format!("{counts}; {} ...", parts.join(", "))
+    format!("{counts}; the first {} %", parts.join(", "))
 }
 
 /// Labels and the first eigenweights, in standard deviations, of all members.

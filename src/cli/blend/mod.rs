@@ -115,14 +115,11 @@ fn save_strip(path: &Path, space: &Space, motions: &[Made]) -> Result<()> {
         (blend.clip(&shape.offsets(), shape.hip_height_m(), 100.0 / blend.duration_s(), 1), blend)
     };
     let played: Vec<_> = motions.iter().map(play).collect();
-    let rows: Vec<Strip> = motions
-        .iter()
-        .zip(&played)
-        .map(|(m, (clip, blend))| {
-            let made = Phases { clip, cycle_s: blend.duration_s() };
-            Strip { label: m.label.clone(), made, recorded: None, cyclic: blend.is_cyclic() }
-        })
-        .collect();
+    let mut rows = Vec::new();
+    for (m, (clip, blend)) in motions.iter().zip(&played) {
+        let made = Phases { clip, cycle_s: blend.duration_s() };
+        rows.push(Strip { label: m.label.clone(), made, recorded: None, cyclic: blend.is_cyclic() });
+    }
     let picture = strips(&rows, FIGURES, FROM_THE_FRONT_RIGHT)?.picture()?;
     Ok(report::save(path, &picture)?)
 }

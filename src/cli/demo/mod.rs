@@ -18,11 +18,10 @@ use muybridge::motion_model::synthetic::{self, SyntheticSubject};
 use muybridge::motion_model::{Activity, Cycle};
 use muybridge::phantom::{Scene, Stage, staging};
 use muybridge::rig::Rig;
-use muybridge::style::{Metric, Population, Style};
+use muybridge::style::{Method, Population, Style};
 use tempfile::TempDir;
 
 use super::check;
-use super::model::default_variance;
 use super::render::{Take, write_session};
 use super::track::{self, NamedModel, Tracked};
 use super::track_report;
@@ -171,9 +170,8 @@ fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Trac
 
 /// As `muybridge generate` does it without options.
 fn at_speed(model: &NamedModel, style: &Style, speed_m_s: f64) -> Result<Synthesis> {
-    let wanted = model.model.components(default_variance(Activity::Walking));
-    let population = Population::new(&model.model, wanted.min(style.weights.len()));
-    Ok(synthesize(&model.model, &population, Metric::Paper, style, speed_m_s, style.hip_height_m)?)
+    let population = Population::new(&model.model, style.weights.len());
+    Ok(synthesize(&model.model, &population, Method::Default, style, speed_m_s, style.hip_height_m)?)
 }
 
 fn marker(truth: &Truth) -> String {

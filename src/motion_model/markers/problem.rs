@@ -348,8 +348,7 @@ impl ArrowProblem for &Problem<'_> {
     fn retract(&self, state: &State, y: &DVector<f64>, z: &DVector<f64>) -> State {
         let mut moved = state.clone();
         let vector = |v: &DVector<f64>, at: usize| Vector3::new(v[at], v[at + 1], v[at + 2]);
-        let turned =
-            |q: &UnitQuaternion<f64>, by: &Vector3<f64>| UnitQuaternion::new_normalize((q * exp(by)).into_inner());
+        let turned = |q: &UnitQuaternion<f64>, by: &Vector3<f64>| UnitQuaternion::new_normalize((q * exp(by)).into_inner());
         for (frame, pose) in moved.poses.iter_mut().enumerate() {
             let first = frame * self.person.width();
             pose.world_from_root = turned(&pose.world_from_root, &vector(y, first));
@@ -407,7 +406,11 @@ mod tests {
             let locals = normal.local_gradient.len();
             let moved = |k: usize, h: f64| {
                 let (mut y, mut z) = (DVector::zeros(locals), DVector::zeros(shareds));
-                if k < locals { y[k] = h } else { z[k - locals] = h }
+                if k < locals {
+                    y[k] = h
+                } else {
+                    z[k - locals] = h
+                }
                 (&problem).retract(&state, &y, &z)
             };
             let h = 1e-5;

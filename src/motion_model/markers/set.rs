@@ -203,7 +203,8 @@ mod tests {
     fn supplied_sets_are_chosen_by_the_names_present() {
         let sets = MarkerSet::supplied().unwrap();
         assert_eq!(sets.iter().map(|s| s.markers.len()).collect::<Vec<_>>(), [6 + 2 * 17, 2 + 2 * 26, 4 + 2 * 24]);
-        let vicon = "Jo:LASI Jo:RASI Jo:SACR Jo:LTHI Jo:LKNE Jo:LTIB Jo:LANK Jo:LHEE Jo:LTOE Jo:RTHI Jo:RKNE Jo:RTIB Jo:RANK Jo:RHEE Jo:RTOE";
+        let vicon =
+            "Jo:LASI Jo:RASI Jo:SACR Jo:LTHI Jo:LKNE Jo:LTIB Jo:LANK Jo:LHEE Jo:LTOE Jo:RTHI Jo:RKNE Jo:RTIB Jo:RANK Jo:RHEE Jo:RTOE";
         let (set, matches) = choose(&sets, &columns(vicon)).unwrap();
         assert_eq!((set.name.as_str(), matches.len()), ("Plug-in Gait", 15));
         let left_ankle = matches.iter().find(|m| m.column == 6).unwrap();

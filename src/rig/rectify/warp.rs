@@ -67,8 +67,8 @@ fn bicubic(image: &GrayImage, x: f32, y: f32) -> f32 {
             true => *image.as_raw()[(top as usize + j) * width + left as usize..].first_chunk::<4>().unwrap_or(&[0; 4]),
             false => border_row(image, left, top + j as isize),
         };
-        for i in 0..4 {
-            sums[i] += weight * f32::from(taps[i]);
+        for (sum, tap) in sums.iter_mut().zip(taps) {
+            *sum += weight * f32::from(tap);
         }
     }
     let weights = catmull_rom(x - x0);
@@ -109,7 +109,8 @@ mod tests {
     #[test]
     fn bicubic_rows_meet_the_definition_up_to_the_border() {
         let image = GrayImage::from_fn(23, 17, |x, y| Luma([((x * 7919 + y * 104_729) % 251) as u8]));
-        let places: Vec<[f32; 2]> = (0..400).map(|i| [-0.5 + 23.0 * (i % 20) as f32 / 19.7, -0.5 + 17.0 * (i / 20) as f32 / 19.7]).collect();
+        let places: Vec<[f32; 2]> =
+            (0..400).map(|i| [-0.5 + 23.0 * (i % 20) as f32 / 19.7, -0.5 + 17.0 * (i / 20) as f32 / 19.7]).collect();
         let mut found = vec![0.0; places.len()];
         bicubic_row(&image, &places, &mut found);
         // Keys' kernel with a = -1/2.

@@ -5,10 +5,32 @@
 //! vectors per attribute, a posture costs four knots; neither depends on the number of examples. The clock keeps its place in the
 //! shape when the timing changes, so that the body does not jump.
 
+use nalgebra::UnitQuaternion;
+
 use super::blend::{Blend, Vectors};
-use super::example::Posture;
+use super::example::{CURVES, Posture};
 use super::manipulate::caricature;
 use super::{Space, SpaceError, attributes, attributes::Method};
+use crate::body::{BALL_JOINTS, DOF};
+use crate::math::rotation::log;
+
+/// What separates `to` from `from` at equal parts of their durations, for a player of another model to add in any amount: rows of
+/// [`CURVES`] in the order of a motion model's channels (78 joint coordinates about its `mean_rotations`, root rotation, root
+/// position), `samples` of them. An attribute live: `from` the mean and `to` the mean with one unit of it.
+pub fn change(from: &Blend, to: &Blend, mean_rotations: &[UnitQuaternion<f64>; BALL_JOINTS], samples: usize) -> Vec<f64> {
+    let mut rows = vec![0.0; samples * CURVES];
+    for (k, row) in rows.chunks_exact_mut(CURVES).enumerate() {
+        let phase = k as f64 / samples as f64;
+        let ((a, root_a), (b, root_b)) = (from.posture(phase), to.posture(phase));
+        for (j, mean) in mean_rotations.iter().enumerate() {
+            let turned = log(&(mean.inverse() * b[j])) - log(&(mean.inverse() * a[j]));
+            row[3 * j..3 * j + 3].copy_from_slice(turned.as_slice());
+        }
+        row[DOF..DOF + 3].copy_from_slice((root_b.rotation - root_a.rotation).as_slice());
+        row[DOF + 3..].copy_from_slice((root_b.position - root_a.position).as_slice());
+    }
+    rows
+}
 
 pub struct Live {
     mean: Vectors,

@@ -7,7 +7,7 @@ use crate::body::{Joint, Pose, Shape, place};
 use crate::math::rotation::exp;
 
 /// Mean height of the right wrist above the floor over the hip height.
-pub const HAND_HEIGHT: &str = "right-hand-height";
+pub const HAND_HEIGHT: &str = "hand-height";
 /// Mean of ½ v² of all joints against the root, J/kg for a body of 1.75 m.
 pub const ENERGY: &str = "energy";
 

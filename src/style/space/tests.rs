@@ -1,5 +1,5 @@
 use super::*;
-use crate::math::rotation::exp;
+use crate::math::rotation::{exp, log};
 use crate::motion_model::synthetic;
 use manipulate::{FARTHEST, caricature, eigenmotion, vary};
 use nalgebra::Vector3;
@@ -280,6 +280,24 @@ fn live_it_is_the_same_motion_and_turning_a_knob_does_not_move_the_body_at_once(
     let duration_s = live.blend().duration_s();
     assert!(live.next(duration_s).0.iter().zip(&before.0).all(|(a, b)| a.angle_to(b) < 1e-9), "one cycle later");
     assert!(live.next(0.3 * duration_s).0[2].angle_to(&before.0[2]) > 0.01);
+}
+
+#[test]
+fn a_change_carries_one_motion_into_the_other_in_anothers_coordinates() {
+    let space = space(false);
+    let [from, to] = [1, 6].map(|m| space.play(&space.members[m].vectors));
+    let others = std::array::from_fn(|j| exp(&Vector3::new(0.01 * j as f64, -0.2, 0.1)));
+    let rows = live::change(&from, &to, &others, 50);
+    for k in [0, 17, 49] {
+        let (row, phase) = (&rows[k * CURVES..], k as f64 / 50.0);
+        let ((a, root_a), (b, root_b)) = (from.posture(phase), to.posture(phase));
+        for j in 0..BALL_JOINTS {
+            let coordinates = log(&(others[j].inverse() * a[j])) + Vector3::from_column_slice(&row[3 * j..3 * j + 3]);
+            assert!((others[j] * exp(&coordinates)).angle_to(&b[j]) < 1e-9);
+        }
+        let position = root_a.position + Vector3::from_column_slice(&row[CURVES - 3..CURVES]);
+        assert!((position - root_b.position).norm() < 1e-12 && (root_a.position - root_b.position).norm() > 1e-4);
+    }
 }
 
 #[test]

@@ -80,7 +80,8 @@ pub fn best_path(costs: &DMatrix<f64>, refine: usize, stiffness: f64) -> Vec<usi
     let (knots, grid) = costs.shape();
     let steps = (refine / 4).max(1)..=4 * refine;
     let work: Vec<f64> = (0..=4 * refine).map(|s| stiffness * (s as f64 / refine as f64).ln().powi(2)).collect();
-    let mut from = DMatrix::from_element(knots, grid, 0usize);
+    // Steps fit a byte, and a long clip's table is the largest thing here.
+    let mut stepped = DMatrix::from_element(knots, grid, 0u8);
     let mut total = vec![f64::INFINITY; grid];
     total[0] = costs[(0, 0)];
     for i in 1..knots {
@@ -89,7 +90,7 @@ pub fn best_path(costs: &DMatrix<f64>, refine: usize, stiffness: f64) -> Vec<usi
             for step in steps.clone().take_while(|&s| s <= j) {
                 let sum = total[j - step] + work[step];
                 if sum < *best {
-                    (*best, from[(i, j)]) = (sum, j - step);
+                    (*best, stepped[(i, j)]) = (sum, step as u8);
                 }
             }
             *best += costs[(i, j)];
@@ -98,7 +99,7 @@ pub fn best_path(costs: &DMatrix<f64>, refine: usize, stiffness: f64) -> Vec<usi
     }
     let mut path = vec![grid - 1; knots];
     for i in (1..knots).rev() {
-        path[i - 1] = from[(i, path[i])];
+        path[i - 1] = path[i] - usize::from(stepped[(i, path[i])]);
     }
     path
 }
