@@ -3,11 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use muybridge::body::{Clip, Joint, Pose};
+use muybridge::io::manifest::find_motions;
 use muybridge::io::markers::read;
+use muybridge::io::read_clip;
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::markers::set::SetMarker;
 use muybridge::motion_model::markers::{MarkerSet, Markers, Solved, choose, solve};
-use muybridge::motion_model::{Activity, synthetic};
+use muybridge::motion_model::{Activity, Label, segment, synthetic};
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -100,11 +102,32 @@ fn runners_agree_with_their_own_inverse_kinematics() {
     }
 }
 
+const WALKS: [&str; 18] = [
+    "2014001_C4_05",
+    "2014001_C5_01",
+    "2014007_C4_04",
+    "2014007_C5_04",
+    "2014015_C4_04",
+    "2014015_C5_03",
+    "2014022_C4_04",
+    "2014022_C5_02",
+    "2014029_C4_05",
+    "2014029_C5_05",
+    "2014031_C4_02",
+    "2014031_C5_05",
+    "2014050_C4_04",
+    "2014050_C5_05",
+    "2015026_C4_04",
+    "2015026_C5_03",
+    "2015035_C4_03",
+    "2015035_C5_03",
+];
+
 #[test]
 fn walkers_agree_with_their_own_inverse_kinematics() {
     let Some(data) = shared("schreiber-walking") else { return };
     println!("{HEAD}");
-    for trial in ["2014007_C5_04", "2014015_C4_04", "2014022_C5_02", "2015026_C5_03"] {
+    for trial in WALKS {
         let (subject, name) = trial.split_at(7);
         let (markers, _) = read(&data.join(subject).join(format!("dynamic/{trial}.c3d"))).unwrap();
         let solved = solved(&markers);
@@ -113,11 +136,11 @@ fn walkers_agree_with_their_own_inverse_kinematics() {
     }
 }
 
-/// A walker's clip, 1.5 s at 100 Hz.
-fn walker() -> Clip {
+/// A walker's clip at 100 Hz.
+fn walker(frames: usize) -> Clip {
     let person = synthetic::subject(Activity::Walking, 5);
     let (cycle, offsets) = (person.mean_cycle(1.3), person.shape().offsets());
-    let poses = (0..150).map(|i| {
+    let poses = (0..frames).map(|i| {
         let (joints, root) = cycle.posture(0.2 + i as f64 / 100.0 / cycle.duration_s);
         let way = Vector3::new(0.0, 1.0, 1.3 * i as f64 / 100.0 / cycle.hip_height_m);
         Pose { root: (root.position + way) * cycle.hip_height_m, world_from_root: exp(&root.rotation), joints }
@@ -166,7 +189,7 @@ fn worst_sagittal_deg(a: &Clip, b: &Clip) -> f64 {
 
 #[test]
 fn a_known_walk_comes_back_through_noise_gaps_and_exchanged_markers() {
-    let clip = walker();
+    let clip = walker(150);
     let sets = MarkerSet::supplied().unwrap();
     let mut markers = recorded(&clip, &sets[0]);
     let found = solved(&markers);
@@ -195,4 +218,44 @@ fn a_known_walk_comes_back_through_noise_gaps_and_exchanged_markers() {
     let (set, matches) = choose(&sets, &markers.names).unwrap();
     let error = solve(&markers, set, &matches).map(|s| s.let_go).unwrap_err().to_string();
     assert!(error.contains("left and right or other names are exchanged"), "{error}");
+}
+
+/// A TRC file of markers in the axes and units that they have.
+fn trc(markers: &Markers) -> String {
+    let (n, m) = (markers.frames.len(), markers.names.len());
+    let mut text = format!("PathFileType\t4\t(X/Y/Z)\tx.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n100\t100\t{n}\t{m}\tmm\n");
+    text += &format!("Frame#\tTime\t{}\n\t\tX1\n\n", markers.names.join("\t\t\t"));
+    for (f, frame) in markers.frames.iter().enumerate() {
+        let cell = |x: &Option<Vector3<f64>>| x.map_or("\t\t".into(), |x| format!("{:.3}\t{:.3}\t{:.3}", x.x, x.y, x.z));
+        text += &format!("{}\t{:.2}\t{}\n", f + 1, f as f64 / 100.0, frame.iter().map(cell).collect::<Vec<_>>().join("\t"));
+    }
+    text
+}
+
+#[test]
+fn a_folder_of_treadmill_markers_becomes_cycles_at_the_manifests_speed() {
+    let clip = walker(230);
+    let mut markers = recorded(&clip, &MarkerSet::supplied().unwrap()[0]);
+    for (f, frame) in markers.frames.iter_mut().enumerate() {
+        // Walking along -y of the file, 13 mm a frame: the belt takes it back.
+        frame.iter_mut().flatten().for_each(|x| x.y += 13.0 * f as f64);
+    }
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir_all(folder.path().join("p1/markers")).unwrap();
+    std::fs::write(folder.path().join("p1/markers/walk.trc"), trc(&markers)).unwrap();
+    let cycles = |speed_m_s: Option<f64>| {
+        let entries = find_motions(&[folder.path().to_path_buf()], None).unwrap();
+        let read = read_clip(&entries[0].path).unwrap();
+        let parameter = speed_m_s.and(entries[0].parameter);
+        let (subject, source) = (entries[0].subject.clone(), "walk".to_string());
+        let label = Label { subject, source, activity: Activity::Walking, parameter, start_s: None, end_s: None };
+        segment(&read.clip, &label).map(|s| (s.cycles, entries[0].subject.clone()))
+    };
+    std::fs::write(folder.path().join("subjects.csv"), "file,subject,speed_m_s\np1/markers/walk.trc,,1.3\n").unwrap();
+    let (found, subject) = cycles(Some(1.3)).unwrap();
+    assert!(!found.is_empty() && subject == "p1" && found.iter().all(|c| c.parameter == 1.3), "{} {subject}", found.len());
+    let truth = synthetic::subject(Activity::Walking, 5).mean_cycle(1.3);
+    assert!((found[0].duration_s / truth.duration_s - 1.0).abs() < 0.02, "{}", found[0].duration_s);
+    assert!((found[0].hip_height_m / truth.hip_height_m - 1.0).abs() < 0.05, "{}", found[0].hip_height_m);
+    assert!(cycles(None).is_err(), "without the belt's speed it stands");
 }

@@ -2,8 +2,8 @@
 //!
 //! An own reader: the `c3dio` crate refuses 12 of the 85 sample files that labs really have and takes room for as many frames
 //! as a header claims; here the file's length bounds everything. Analog samples are stepped over.
-//! Frames: TRIAL:ACTUAL_*_FIELD, else POINT:LONG_FRAMES, else POINT:FRAMES where the header's count is not the same, as many
-//! as the file holds. Points with a negative residual, not finite, or at the origin exactly were not seen.
+//! Frames: TRIAL:ACTUAL_*_FIELD, else POINT:LONG_FRAMES, else the header's count, POINT:FRAMES where that is none or at its
+//! limit; never more than the file holds. Points with a negative residual, not finite, or at the origin exactly were not seen.
 //! Checked against `c3dio` on all files that it reads, and on one trial in six encodings.
 
 use std::collections::HashMap;

@@ -3,7 +3,7 @@
 //! Stature, segment lengths and marker offsets are learnt together with the poses of at most [`LEARNT_FRAMES`] frames spread
 //! over the recording (equation (1) of `problem`, bordered by the shared unknowns); then the poses of all frames are found with
 //! these held, in stretches of [`STRETCH`] frames that overlap by [`OVERLAP`], so that long recordings need no more memory per
-//! frame. At most a few frames are lost by learning from a part: a person does not grow within a trial.
+//! frame. A person does not grow within a trial: a part of the frames is enough for what does not change.
 //! The forearm's twist is found at the elbow, whose frame the wrist's markers ride on, and given to the wrist as in OpenSim's
 //! models; the trunk moves at vl5 alone, as there.
 //! Fails when: a segment's markers are missing from the whole recording (it then keeps its mean posture), or fewer than three
@@ -41,7 +41,7 @@ pub enum IkError {
     Empty,
     #[error("one frame is no motion; two with the pelvis in sight are the least")]
     OneFrame,
-    #[error("the body does not stand along an axis of the file; the first frames of a recording must show a standing person")]
+    #[error("no axis of the file is up for these markers; the recording must show a person who stands, walks or runs")]
     Lying,
     #[error("the markers span a person of {size:.3} units, which is no human size in m, cm or mm; correct the file's unit of length")]
     Size { size: f64 },
