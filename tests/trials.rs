@@ -43,10 +43,10 @@ fn expected(data: &Path) -> Vec<Expected> {
     text.lines().skip(1).filter_map(row).collect()
 }
 
-/// Cycles and their median speed, or why there are none.
+/// Cycles and mean speed, or why there are none.
 type Found = Result<(usize, f64), String>;
 
-/// What our program finds.
+/// What our program finds: cycles and their median speed, or why none.
 fn found(entries: &[Entry], e: &Expected) -> Found {
     let is_it = |x: &&Entry| {
         let path = x.path.to_string_lossy();
@@ -79,7 +79,8 @@ fn cycles_and_speeds_of_every_shared_trial() {
     }
     let folders: Vec<PathBuf> = SETS.iter().map(|s| data.join(s.1)).collect();
     let entries = find_motions(&folders, None).unwrap();
-    let rows: Vec<(Expected, Found)> = expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
+    let rows: Vec<(Expected, Found)> =
+        expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
     for (e, found) in &rows {
         let what = match found {
             Ok((cycles, speed)) => format!("{cycles:>2} {speed:>6.2}"),
