@@ -58,7 +58,7 @@ fn apart(a: f64, b: f64) -> f64 {
 /// The cycle with its clock bent: at part t of the new duration it does what it did at t + bend(t).
 fn bent(cycle: &Cycle, name: &str) -> Example {
     let mut example = Example::of_cycle(name, cycle);
-    let bend = |t: f64| t + 0.055 * (std::f64::consts::TAU * t).sin();
+    let bend = |t: f64| t + 0.025 * (1.0 - (std::f64::consts::TAU * t).cos());
     let forward = |t: f64| {
         let (joints, mut root) = cycle.posture(bend(t));
         root.position.z += example.stride * (bend(t) - t);
@@ -79,7 +79,7 @@ fn walks_at_different_speeds_meet_at_their_heel_strikes() {
             .unwrap()
             .path
     };
-    let (mut straight, mut without) = (0.0f64, 0.0f64);
+    let mut without = 0.0f64;
     for (slow, fast) in [("07_03", "07_11"), ("08_04", "08_06"), ("07_03", "08_08")] {
         let [slow, fast] = [slow, fast].map(|t| cycles(&find(t), None).remove(0));
         assert!(fast.parameter > 1.4 * slow.parameter, "{} {}", slow.parameter, fast.parameter);
@@ -102,7 +102,6 @@ fn walks_at_different_speeds_meet_at_their_heel_strikes() {
                     100.0 * uncarried
                 );
                 assert!(error < 0.02, "{error}");
-                straight = straight.max(error);
                 without = without.max(uncarried);
             }
         }
@@ -265,8 +264,11 @@ fn the_command_builds_mixes_and_changes() {
     let own = at("w4.bvh");
     let (done, _, error) = run(&["blend", "caricature", &space, "--of", &own, "--degree", "0.5,1.5,2", "-o", &at("car")]);
     let degrees: Vec<f64> = (0..5).map(|row| cell(&at("car"), row, 3)).collect();
-    assert!(done && degrees.windows(2).skip(1).all(|w| w[1] < w[0] || w[1] > 0.0) && degrees[4] == 0.0, "{error} {degrees:?}");
-    assert!((degrees[0] / degrees[3] - 2.0).abs() < 0.01, "strongest first, the original above the mean: {degrees:?}");
+    assert!(done, "{error}");
+    // The strongest first, then the original and the mean.
+    for (row, degree) in [(0, 2.0), (1, 1.5), (2, 0.5), (4, 0.0)] {
+        assert!((degrees[row] / degrees[3] - degree).abs() < 0.01, "{degrees:?}");
+    }
     let (done, ..) = run(&["blend", "vary", &space, "--count", "3", "--cycles", "2", "-o", &at("crowd")]);
     assert!(done && ["person_1.bvh", "person_3.json", "strip.png"].iter().all(|f| dir.path().join("crowd").join(f).is_file()));
     let (done, said, _) = run(&["blend", "info", &space, "-o", &at("info")]);

@@ -43,8 +43,11 @@ fn expected(data: &Path) -> Vec<Expected> {
     text.lines().skip(1).filter_map(row).collect()
 }
 
+/// Cycles and mean speed, or why there are none.
+type Found = Result<(usize, f64), String>;
+
 /// What our program finds: cycles and their median speed, or why none.
-fn found(entries: &[Entry], e: &Expected) -> Result<(usize, f64), String> {
+fn found(entries: &[Entry], e: &Expected) -> Found {
     let is_it = |x: &&Entry| {
         let path = x.path.to_string_lossy();
         path.contains(e.folder)
@@ -76,7 +79,7 @@ fn cycles_and_speeds_of_every_shared_trial() {
     }
     let folders: Vec<PathBuf> = SETS.iter().map(|s| data.join(s.1)).collect();
     let entries = find_motions(&folders, None).unwrap();
-    let rows: Vec<(Expected, Result<(usize, f64), String>)> =
+    let rows: Vec<(Expected, Found)> =
         expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
     for (e, found) in &rows {
         let what = match found {
