@@ -201,7 +201,8 @@ mod tests {
             for g in opensim() {
                 let turns: Vec<f64> = g.names.iter().map(|n| angles(n, k)).collect();
                 let q = match &g.kind {
-                    Kind::Zxy(m) => {
+                    Kind::Zxy(mirror) => {
+                        let m = *mirror;
                         let [z, x, y] =
                             [-Vector3::x() * turns[0], Vector3::z() * *m * turns[1], Vector3::y() * *m * turns[2]].map(|v| exp(&v));
                         z * x * y
