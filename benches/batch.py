@@ -3,10 +3,10 @@
 
     python3 benches/batch.py target/release/muybridge /tmp/batch-bench [--sessions 60] [--kills 20] [--counts 10,50,200] [--slurm]
 
-Prints one line per figure. The footage is the phantom's: 10 frames of 160x120 px per session. Takes about twenty minutes on
+Prints one line per figure. The footage is the phantom's: 6 frames of 160x120 px per session. Takes about twenty minutes on
 two idle cores; other load makes the figures of cores and seconds worse.
 """
-import argparse, hashlib, os, random, resource, shutil, subprocess, sys, time
+import argparse, hashlib, json, os, random, resource, shutil, subprocess, sys, time
 
 parser = argparse.ArgumentParser()
 parser.add_argument("muybridge")
@@ -18,7 +18,7 @@ parser.add_argument("--slurm", action="store_true")
 args = parser.parse_args()
 PROGRAM, PLACE = os.path.abspath(args.muybridge), os.path.abspath(args.place)
 RIG = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "calib", "phantom_lab.toml")
-FRAMES = 10
+FRAMES = 6
 
 
 def run(*arguments, check=True):
@@ -119,6 +119,15 @@ def timed(folder, results):
     return done, seconds, cpu, load
 
 
+def occupied(results, seconds, jobs):
+    """Share of the time in which all of the jobs had a session in work, whatever else the machine did."""
+    worked = 0.0
+    for folder, _, names in os.walk(results):
+        if "status.json" in names and ".work" not in folder:
+            worked += json.load(open(os.path.join(folder, "status.json")))["seconds"] or 0.0
+    return worked / (seconds * jobs)
+
+
 def supervisor_peak_mb(folder, results):
     """Largest resident memory of the supervising process alone, sampled."""
     process = subprocess.Popen([PROGRAM, "batch", folder, "-o", results], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -140,7 +149,8 @@ source = film()
 folder = study("study", source, args.sessions, {i: f for i, f in six_ways().items() if i < args.sessions})
 calm = os.path.join(PLACE, "calm")
 done, seconds, cpu, load = timed(folder, calm)
-print(f"undisturbed: exit {done.returncode}, {seconds:.1f} s, cores {cpu / seconds:.2f} of {os.cpu_count()} (load before {load:.1f})")
+print(f"undisturbed: exit {done.returncode}, {seconds:.1f} s, cores {cpu / seconds:.2f} of {os.cpu_count()} "
+      f"(load before {load:.1f}), {100 * occupied(calm, seconds, os.cpu_count()):.1f} % of {os.cpu_count()} jobs in work")
 print("\n".join(done.stdout.splitlines()[-8:]))
 again, seconds, _, _ = timed(folder, calm)
 print(f"again: {again.stdout.splitlines()[0]}; {seconds:.2f} s")
@@ -167,4 +177,5 @@ if args.slurm:
 for count in map(int, filter(None, args.counts.split(","))):
     many = study(f"many_{count}", source, count, {})
     peak, seconds, cpu = supervisor_peak_mb(many, os.path.join(PLACE, f"results_{count}"))
-    print(f"{count} sessions: {seconds:.1f} s, {seconds / count:.3f} s and {cpu / count:.3f} CPU s a session, supervisor {peak:.0f} MB")
+    print(f"{count} sessions: {seconds:.1f} s, {seconds / count:.3f} s and {cpu / count:.3f} CPU s a session, supervisor {peak:.0f} MB, "
+          f"{100 * occupied(os.path.join(PLACE, f'results_{count}'), seconds, os.cpu_count()):.1f} % of the jobs in work")

@@ -132,9 +132,9 @@ impl Grid {
     fn nets(&self) -> (Vec<Vector3<f64>>, Vec<[u32; 4]>) {
         let (mut vertices, mut quads) = (Vec::new(), Vec::new());
         let mut vertex_of_cell = vec![u32::MAX; self.values.len()];
-        for index in 0..self.values.len() {
+        for (index, cell) in vertex_of_cell.iter_mut().enumerate() {
             if let Some(vertex) = self.crossing(self.place(index)) {
-                vertex_of_cell[index] = vertices.len() as u32;
+                *cell = vertices.len() as u32;
                 vertices.push(vertex);
             }
         }

@@ -34,6 +34,10 @@ pub struct GenerateArgs {
     /// style.json of `track`, or a motion file of the person
     #[arg(long)]
     style: PathBuf,
+    /// The same person at another speed or length, style.json or motion file, the latter with its speed where that cannot be
+    /// measured: run.mot@4m/s; repeat for several
+    #[arg(long, value_name = "STYLE")]
+    also: Vec<String>,
     /// Speeds or jump lengths: 3km/h, 1.25m/s, 80cm; bare numbers are m/s, for jumps m
     #[arg(long, required_unless_present = "profile", value_delimiter = ',')]
     at: Vec<String>,
@@ -111,7 +115,11 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     if !model.activity.is_cyclic() && (args.profile.is_some() || args.turn_radius.is_some()) {
         bail!("{} holds jumps; --profile and --turn-radius are for walking and running", args.model.display());
     }
-    let style = load_style(&args.model, &model, &args.style, args.recorded_at.as_deref())?;
+    let mut style = load_style(&args.model, &model, &args.style, args.recorded_at.as_deref())?;
+    for text in &args.also {
+        let (path, recorded_at) = text.rsplit_once('@').map_or((text.as_str(), None), |(path, at)| (path, Some(at)));
+        style = style.and(load_style(&args.model, &model, Path::new(path), recorded_at)?);
+    }
     let shape = target_shape(&args, &style);
     match &args.profile {
         Some(text) => along_profile(&args, &model, &style, &shape, &profile::read(text, args.turn_radius)?),
@@ -124,9 +132,8 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -
     let names = file_names(model.activity, &values)?;
     let (population, method) = (population(args, model, style)?, method(args)?);
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
-    let mut syntheses = Vec::new();
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
-    let mut motions = Vec::new();
+    let (mut motions, mut syntheses) = (Vec::new(), Vec::new());
     for (value, name) in values.iter().zip(&names) {
         let synthesis = synthesize(model, &population, method, style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
@@ -165,9 +172,9 @@ fn method_words(method: Method) -> &'static str {
 fn report(args: &GenerateArgs, model: &Model, style: &Style, made: Vec<generated::Made>) -> Result<()> {
     let page = GeneratedReport {
         model,
-        model_name: &args.model.display().to_string(),
+        model_name: &file_name(&args.model),
         style,
-        style_name: &args.style.display().to_string(),
+        style_name: &file_name(&args.style),
         made,
         options: &[("method", method_words(method(args)?).to_string()), ("frames per second", args.fps.to_string())],
     };
@@ -257,10 +264,7 @@ fn write_files(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape,
 }
 
 fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Result<Population> {
-    let part = args.variance.or(match method(args)? {
-        Method::Default => None,
-        Method::Paper(_) => Some(default_variance(model.activity)),
-    });
+    let part = args.variance.or((method(args)? != Method::Default).then(|| default_variance(model.activity)));
     let wanted = part.map_or(style.weights.len(), |v| model.components(v));
     Ok(Population::new(model, wanted.min(style.weights.len())))
 }

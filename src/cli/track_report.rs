@@ -9,6 +9,7 @@ use muybridge::report::page::jpeg;
 use muybridge::report::track::{TrackReport, thumbnail};
 use muybridge::report::walk::Walk;
 
+use super::motions::file_name;
 use super::track::{NamedModel, Tracked, clip, style};
 
 /// Writes report.html, thumbnail.jpg and, for gaits, gait.csv and angles_cycle.csv. The page names
@@ -16,7 +17,7 @@ use super::track::{NamedModel, Tracked, clip, style};
 pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
     let Tracked { fit, observations, pictures, depth } = tracked;
     let whole = session.folder.canonicalize().unwrap_or_else(|_| session.folder.clone());
-    let name = whole.file_name().unwrap_or_default().to_string_lossy();
+    let name = file_name(&whole);
     let (clip, _) = clip(fit, &session.rig, observations, session.fps)?;
     let walk = Walk::of(fit, &clip, model.model.activity, observations.first().map_or(0.0, |o| o.time_s));
     if let Some(walk) = &walk {

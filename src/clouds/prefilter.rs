@@ -109,7 +109,9 @@ fn weighted_sum_plain(lines: &[&[f32]], weights: &[f32], out: &mut [f32]) {
         let mut sums = [0.0; BLOCK];
         for (line, weight) in lines.iter().zip(weights) {
             if let Some(values) = line[k * BLOCK..].first_chunk::<BLOCK>() {
-                (0..BLOCK).for_each(|i| sums[i] += weight * values[i]);
+                for (sum, value) in sums.iter_mut().zip(values) {
+                    *sum += weight * value;
+                }
             }
         }
         *out = sums;

@@ -256,7 +256,7 @@ pub(crate) fn person_mask(
     let canvas = rectification.size_px[0] as usize;
     let [disparity, ground] = [&found.disparity, &stage.disparity].map(|plane| region.cut(plane, canvas));
     let places = region.rows(canvas).flatten().zip(changes[k].shaded(region));
-    let at = |((i, shaded), (d, stage)): ((usize, bool), (&f32, &f32))| label(rectification, k, i, changes, shaded, *stage, *d, options);
+    let at = |((i, shaded), (d, stage)): ((usize, bool), (&f32, &f32))| label(rectification, k, i, changes, shaded, [*d, *stage], options);
     let labels: Vec<Label> = places.zip(disparity.iter().zip(&ground)).map(at).collect();
     let density =
         |wanted: Label| blur(&labels.iter().map(|&l| if l == wanted { 1.0 } else { 0.0 }).collect::<Vec<_>>(), region.width(), 2.0);
@@ -309,8 +309,7 @@ fn label(
     i: usize,
     changes: &[Change],
     shaded: bool,
-    stage_px: f32,
-    disparity: f32,
+    [disparity, stage_px]: [f32; 2],
     options: &StageOptions,
 ) -> Label {
     let changed = changes[k].changed.as_raw()[i] != 0;

@@ -120,9 +120,11 @@ pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed:
     let mut now = disparity.as_raw().clone();
     let mut fits: Vec<Option<Fit>> = vec![None; now.len()];
     let weights = window_weights();
+    let here = |other: &Other| slopes(reference, &now, other.step);
+    let here: Vec<Vec<f32>> = others.iter().map(here).collect();
     for _ in 0..ROUNDS {
         let planes: Vec<f32> = per_pixel(&now, |i| plane_at(&now, width as usize, i));
-        let look = |(k, other): (usize, &Other)| look_along(reference, other, &planes, confirmed, 1 << k);
+        let look = |(k, other): (usize, &Other)| look_along(reference, &here[k], other, &planes, confirmed, 1 << k);
         let seen: Vec<Seen> = others.iter().enumerate().map(look).collect();
         let found: Vec<Option<Fit>> = (0..now.len()).into_par_iter().map(|i| fit_window(reference, &seen, &planes, &weights, i)).collect();
         for (i, fit) in found.into_iter().enumerate() {
@@ -172,17 +174,25 @@ fn plane_at(disparity: &[f32], width: usize, i: usize) -> f32 {
     here + normal.cholesky().map_or(0.0, |c| c.solve(&Vector3::from(right))[0])
 }
 
-/// The other view where it sees the surface; NaN where it does not confirm it.
-fn look_along(reference: &Plane, other: &Other, planes: &[f32], confirmed: &[u8], bit: u8) -> Seen {
-    let (width, step) = (reference.width() as usize, other.step);
+/// Derivative of the reference's picture along a step, where there is a disparity.
+fn slopes(reference: &Plane, disparity: &[f32], step: Vector2<f32>) -> Vec<f32> {
+    let width = reference.width() as usize;
+    per_pixel(disparity, |i| {
+        let at = |d: f32| sample(reference, (i % width) as f32 + d * step.x, (i / width) as f32 + d * step.y);
+        at(0.5) - at(-0.5)
+    })
+}
+
+/// The other view where it sees the surface; NaN where it does not confirm it. `here` are the reference's own derivatives.
+fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], confirmed: &[u8], bit: u8) -> Seen {
+    let width = reference.width() as usize;
     let one = |(i, &d): (usize, &f32)| {
         if d.is_nan() || confirmed[i] & bit == 0 {
             return (f32::NAN, [f32::NAN; 2]);
         }
         let (x, y) = ((i % width) as f32, (i / width) as f32);
         let there = |d: f32| other.see(x, y, d);
-        let here = |d: f32| sample(reference, x + d * step.x, y + d * step.y);
-        (there(d), [there(d + 0.5) - there(d - 0.5), here(0.5) - here(-0.5)])
+        (there(d), [there(d + 0.5) - there(d - 0.5), here[i]])
     };
     let samples: Vec<(f32, [f32; 2])> = planes.par_iter().enumerate().map(one).collect();
     let (gain, offset) = exposure(samples.iter().zip(reference.iter()).map(|(s, r)| (*r, s.0)));

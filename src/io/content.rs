@@ -6,8 +6,6 @@
 
 use std::path::{Path, PathBuf};
 
-use rayon::prelude::*;
-
 use super::calib_toml;
 use super::images::is_image_name;
 use super::session::{file_name, list};
@@ -39,12 +37,10 @@ pub fn program(executable: &Path) -> String {
 
 /// Hash of a session folder's inputs.
 pub fn inputs_hash(session: &Path) -> String {
-    let files = input_files(session);
-    let hashes: Vec<String> = files.par_iter().map(|path| file_hash(path)).collect();
     let mut hasher = blake3::Hasher::new();
-    for (path, hash) in files.iter().zip(hashes) {
-        let name = path.strip_prefix(session).unwrap_or(path).as_os_str().as_encoded_bytes();
-        hasher.update(&(name.len() as u64).to_le_bytes()).update(name).update(hash.as_bytes());
+    for path in input_files(session) {
+        let name = path.strip_prefix(session).unwrap_or(&path).as_os_str().as_encoded_bytes();
+        hasher.update(&(name.len() as u64).to_le_bytes()).update(name).update(file_hash(&path).as_bytes());
     }
     hasher.finalize().to_hex().to_string()
 }

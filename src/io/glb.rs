@@ -1,6 +1,6 @@
 //! Skinned skeletons and their motions as binary glTF 2.0 (GLB), read and written.
 //!
-//! Written: every bone a node, one skin over all of them, one mesh with vertex colours, one animation per motion with
+//! Written: every bone a node, one skin over all of them, one mesh with normals and vertex colours, one animation per motion with
 //! rotations of all bones and translations of those that move; y up, metres if the creature is in metres, seconds.
 //! Read: nodes, skins, triangles and base colours of all meshes, animations (step, linear, cubic spline) at the union of
 //! their key times. Everything must be inside the one file. Checked against the `gltf` crate's own validation and by

@@ -3,7 +3,9 @@
 //!
 //! The file's rest is the [stance](crate::body::mesh::stance) in which the skin was taken; every motion sets the rotations of all
 //! nodes and the translation of the root. y up, metres, the person looks along +z at rest.
-//! Checked against the clip's forward kinematics and the implicit surface.
+//! Limbs lie on the implicit surface within 2 mm at rest; the trunk, which the few primitives that are enough to fit clouds
+//! leave ringed, and the head, are drawn evenly. Linear blending leaves 4 mm on average in a walk and 7 mm in a run, most
+//! of it where limbs touch and the implicit surface swells. Checked against the clip's forward kinematics and that surface.
 
 use nalgebra::{Matrix4, Vector3};
 

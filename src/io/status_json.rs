@@ -7,6 +7,7 @@
 //! | `group/walk_03/` | what `muybridge track` writes, whole or not there, and `status.json` |
 //! | `logs/group/walk_03.log` | what the last run said; locked while it runs |
 //! | `summary.csv` | sessions in natural order, one row each |
+//! | `index.html` | the same as a page, failures first, with links to the sessions' reports |
 //! | `.work/` | what unfinished sessions keep; may be removed when no batch runs |
 //!
 //! `status.json` has the fields of [`Status`]; the outputs are there exactly when its `state` is `done`. Times of day, durations, hosts and memory stand
@@ -143,7 +144,8 @@ pub fn write_summary(results: &Path, statuses: &[Status]) -> Result<(), StatusEr
     write_atomic(&path, text.as_bytes()).map_err(|error| StatusError::Write { path: path.clone(), error })
 }
 
-fn row(results: &Path, status: &Status) -> [String; COLUMNS.len()] {
+/// A session's values of [`COLUMNS`].
+pub fn row(results: &Path, status: &Status) -> [String; COLUMNS.len()] {
     let done = status.state == State::Done;
     let bytes = done.then(|| std::fs::read(results.join(&status.session).join("fit.json")).ok()).flatten();
     let fit: serde_json::Value = bytes.and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();

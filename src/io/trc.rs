@@ -1,4 +1,4 @@
-//! TRC marker recordings (Motion Analysis, OpenSim, Pose2Sim): a table of tabs.
+//! TRC marker recordings (Motion Analysis, OpenSim, Pose2Sim): a table of tabs, commas where a spreadsheet wrote it.
 //!
 //! Empty cells, NaN in any spelling and 0 0 0 are markers not seen. The time column decides the frame rate where the header's
 //! differs; the blank line before the rows may be there or not.
@@ -28,10 +28,16 @@ pub fn read(path: &Path) -> Result<(Markers, Vec<String>), TrcError> {
     parse(&String::from_utf8_lossy(&bytes)).map_err(|(line, what)| TrcError::Syntax { path: path.into(), line, what })
 }
 
-/// Cells of a line, whose tabs count unless there are none.
+/// Cells of a line between tabs, else commas, else blanks.
 fn cells(line: &str) -> Vec<&str> {
-    let line = line.trim_end_matches(['\r', '\n']);
-    if line.contains('\t') { line.split('\t').map(str::trim).collect() } else { line.split_whitespace().collect() }
+    match ['\t', ','].into_iter().find(|c| line.contains(*c)) {
+        Some(separator) => line.split(separator).map(str::trim).collect(),
+        None => line.split_whitespace().collect(),
+    }
+}
+
+fn separates(c: char) -> bool {
+    c.is_whitespace() || c == ','
 }
 
 fn parse(text: &str) -> Result<(Markers, Vec<String>), Fault> {
@@ -40,8 +46,9 @@ fn parse(text: &str) -> Result<(Markers, Vec<String>), Fault> {
     if !lines.first().is_some_and(|l| l.trim_start_matches('\u{feff}').starts_with("PathFileType")) {
         return Err((1, "does not begin with PathFileType: this is no TRC file".into()));
     }
-    let fields: Vec<&str> = lines.get(1).map(|l| l.split_whitespace().collect()).unwrap_or_default();
-    let values: Vec<&str> = lines.get(2).map(|l| l.split_whitespace().collect()).unwrap_or_default();
+    let words =
+        |line: usize| -> Vec<&str> { lines.get(line).map(|l| l.split(separates).filter(|w| !w.is_empty()).collect()).unwrap_or_default() };
+    let (fields, values) = (words(1), words(2));
     let field = |name: &str| fields.iter().position(|f| *f == name).and_then(|i| values.get(i).copied());
     let header = at(3);
     if !header.first().is_some_and(|c| c.starts_with("Frame")) {

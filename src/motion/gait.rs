@@ -19,7 +19,7 @@ use nalgebra::{DVector, UnitQuaternion, Vector3};
 use super::playback::{Synthesis, synthesize};
 use crate::body::{BALL_JOINTS, DOF, Joint, NODES, Pose, place};
 use crate::math::rotation::{exp, log};
-use crate::motion_model::{Activity, Model, ROOT_CHANNELS, SAMPLES};
+use crate::motion_model::{Activity, Cycle, Model, ROOT_CHANNELS, SAMPLES};
 use crate::style::{Method, Population, Style, StyleError};
 
 /// Joint coordinates and root channels of one sample.
@@ -159,6 +159,22 @@ impl Gait {
         own
     }
 
+    /// What separates one cycle from another as a change for [`Gait::add_change`]: an attribute, made where labels are known.
+    pub fn change(&self, from: &Cycle, to: &Cycle) -> Vec<f64> {
+        let coordinates = |cycle: &Cycle| {
+            let mut rows = Vec::with_capacity(SAMPLES * CHANNELS);
+            for (joints, root) in cycle.joints.iter().zip(&cycle.root) {
+                for (mean, joint) in self.mean_rotations.iter().zip(joints) {
+                    rows.extend_from_slice(log(&(mean.inverse() * joint)).as_slice());
+                }
+                rows.extend_from_slice(root.rotation.as_slice());
+                rows.extend_from_slice(root.position.as_slice());
+            }
+            rows
+        };
+        coordinates(to).iter().zip(coordinates(from)).map(|(b, a)| b - a).collect()
+    }
+
     /// Cycles per second at a speed.
     pub fn frequency_hz(&self, speed_m_s: f64) -> f64 {
         let (slowest, fastest) = self.range_m_s();
@@ -264,14 +280,15 @@ fn speeds(model: &Model, scale: f64) -> Vec<f64> {
     (0..=steps as usize).map(|k| low + (high - low) * k as f64 / steps).collect()
 }
 
-/// The rows of a synthesis, its detail with them.
-fn cycle(model: &Model, s: &Synthesis) -> Vec<f64> {
-    let (mut vector, mut root) = (model.vector(s.weights.as_slice()), model.root(s.weights.as_slice()));
-    if let Some(detail) = &s.detail {
-        vector += &detail.vector;
+/// The cycle of a synthesis as [`rows`].
+fn cycle(model: &Model, synthesis: &Synthesis) -> Vec<f64> {
+    let weights = synthesis.weights.as_slice();
+    let (mut joints, mut root) = (model.vector(weights), model.root(weights));
+    if let Some(detail) = &synthesis.detail {
+        joints += &detail.vector;
         root += &detail.root;
     }
-    rows(&vector, &root)
+    rows(&joints, &root)
 }
 
 /// Joint coordinates and root channels side by side, one row per sample.

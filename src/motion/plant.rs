@@ -55,10 +55,10 @@ pub fn plant_feet(clip: &Clip) -> Planted {
     let mut planted = Planted { clip: clip.clone(), contacts, unreached: 0 };
     for (frame, pose) in planted.clip.poses.iter_mut().enumerate() {
         pose.root.y += lift[frame];
-        for side in 0..2 {
+        for (side, leg) in LEGS.into_iter().enumerate() {
             let foot = exp(&Vector3::new(0.0, corrections[side][frame].x, 0.0)) * feet[side].world_from_foot[frame];
             let hold = hold(&planted.contacts[side], frame, RELEASE_S * clip.fps);
-            let met = reach(pose, &clip.offsets, LEGS[side], &targets[side][frame], &foot, DAMPING_M / hold);
+            let met = reach(pose, &clip.offsets, leg, &targets[side][frame], &foot, DAMPING_M / hold);
             planted.unreached += usize::from(!met && hold == 1.0);
         }
     }

@@ -9,9 +9,9 @@ use super::player::{Eased, GRAVITY_M_S2, Gaits, Player};
 use super::{Profile, Waypoint, follow, plant_feet, play};
 use crate::body::{Clip, Joint, NODES, Pose, Shape};
 use crate::math::rotation::log;
-use crate::motion::{Length, synthesize};
-use crate::motion_model::{Activity, Model, synthetic};
-use crate::style::{Method, Metric, Population, Style};
+use crate::motion::{Length, Synthesis, synthesize};
+use crate::motion_model::{Activity, Cycle, Model, synthetic};
+use crate::style::{Method, Population, Style};
 
 const WALKS: [f64; 4] = [0.8, 1.2, 1.6, 2.0];
 const RUNS: [f64; 4] = [1.8, 2.3, 2.8, 3.4];
@@ -36,7 +36,7 @@ fn style(model: &Model, speed: f64) -> Style {
 fn gait(model: &Model, speed: f64) -> Gait {
     let style = style(model, speed);
     let population = Population::new(model, style.weights.len());
-    Gait::of_style(model, &population, Method::Paper(Metric::Paper), &style, hip_height_m(), &offsets()).unwrap().unwrap().0
+    Gait::of_style(model, &population, Method::Default, &style, hip_height_m(), &offsets()).unwrap().unwrap().0
 }
 
 fn gaits() -> Gaits {
@@ -81,13 +81,13 @@ fn a_steady_gait_plays_the_models_postures() {
     let model = model(Activity::Walking, WALKS);
     let style = style(&model, 1.2);
     let population = Population::new(&model, style.weights.len());
-    let at = |v: f64| synthesize(&model, &population, Method::Paper(Metric::Paper), &style, v, hip_height_m()).unwrap();
+    let at = |v: f64| synthesize(&model, &population, Method::Default, &style, v, hip_height_m()).unwrap();
     let synthesis = at(1.3);
     let steady = Gait::steady(&model, &synthesis, &offsets()).unwrap();
     let over_speeds = gait(&model, 1.2);
     for k in 0..100 {
         let phase = f64::from(k) / 100.0;
-        let (joints, root) = model.posture(synthesis.weights.as_slice(), phase);
+        let (joints, root) = model.posture_with(synthesis.weights.as_slice(), synthesis.detail.as_ref(), phase);
         let posture = steady.posture(1.3, phase, std::iter::empty());
         assert!(posture.joints.iter().zip(&joints).all(|(a, b)| a.angle_to(b) < 1e-7));
         assert!((posture.root - root.position).norm() < 1e-9);
@@ -108,6 +108,28 @@ fn a_steady_gait_plays_the_models_postures() {
         assert!((a.root - b.root).norm() < 1e-3, "{:?} {:?}", a.root, b.root);
         assert!(turns(a, b).iter().all(|t| t.norm() < 0.01));
     }
+}
+
+#[test]
+fn a_body_of_half_the_size_moves_alike_at_half_the_speed() {
+    let model = model(Activity::Walking, WALKS);
+    let style = style(&model, 1.2);
+    let population = Population::new(&model, style.weights.len());
+    let [large, small] = [1.7, 0.85].map(|stature_m| {
+        let shape = Shape::template(stature_m);
+        Gait::of_style(&model, &population, Method::Default, &style, shape.hip_height_m(), &shape.offsets()).unwrap().unwrap().0
+    });
+    let (a, b) = (large.range_m_s(), small.range_m_s());
+    assert!((a.0 / b.0 - 2.0).abs() < 1e-9 && (a.1 / b.1 - 2.0).abs() < 1e-9);
+    for phase in [0.1, 0.45, 0.8] {
+        let (p, q) = (large.posture(1.4, phase, std::iter::empty()), small.posture(0.7, phase, std::iter::empty()));
+        assert!(p.joints.iter().zip(&q.joints).all(|(p, q)| p.angle_to(q) < 0.01) && (p.root - q.root).norm() < 1e-3);
+        let same_speed = small.posture(1.0, phase, std::iter::empty());
+        assert!(same_speed.joints.iter().zip(&q.joints).any(|(p, q)| p.angle_to(q) > 0.03));
+    }
+    assert!((large.frequency_hz(1.4) / small.frequency_hz(0.7) - 1.0).abs() < 0.01);
+    let runs = Gaits::walk_and_run(small.clone(), small).transition_m_s().unwrap();
+    assert!((runs - (0.25 * 9.81 * hip_height_m()).sqrt()).abs() < 1e-9);
 }
 
 #[test]
@@ -283,6 +305,25 @@ fn changes_are_mixed_in_smoothly_while_it_plays() {
     let (mixed, lively) = (roughness(&clip), steady(2.0));
     assert!(mixed[1] < 1.1 * lively[1] && mixed[3] < 1.1 * lively[3], "rougher than either: {mixed:?} {lively:?}");
     assert!(lively[1] > 1.2 * steady(0.0)[1]);
+}
+
+#[test]
+fn the_change_between_two_cycles_turns_one_into_the_other() {
+    let [a, b] = [7, 8].map(|seed| synthetic::subject(Activity::Walking, seed).mean_cycle(1.2));
+    let model = Model::build(Activity::Walking, true, &[a.clone(), b.clone()]).unwrap();
+    let weights = model.project(&model.vector_of(&a));
+    let (hip_height_m, frequency_hz) = (a.hip_height_m, 1.0 / a.duration_s);
+    let (shares, detail, sd, notice) = (Vec::new(), None, None, None);
+    let synthesis = Synthesis { weights, detail, sd, parameter: 1.2, hip_height_m, frequency_hz, shares, notice };
+    let mut gait = Gait::steady(&model, &synthesis, &offsets()).unwrap();
+    let change = gait.change(&a, &b);
+    gait.add_change(change).unwrap();
+    for k in 0..100 {
+        let at = |amount: f64| gait.posture(1.2, k as f64 / 100.0, [amount].into_iter());
+        let off =
+            |amount: f64, cycle: &Cycle| at(amount).joints.iter().zip(&cycle.joints[k]).map(|(p, q)| p.angle_to(q)).fold(0.0, f64::max);
+        assert!(off(0.0, &a) < 1e-6 && off(1.0, &b) < 1e-6 && off(0.0, &b) > 0.01, "{k}: {} {}", off(0.0, &a), off(1.0, &b));
+    }
 }
 
 /// Largest drift in m of a point of the sole while it touches (within 2 mm of the lowest), over one contact.

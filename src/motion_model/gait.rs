@@ -6,8 +6,10 @@
 //!   stride length = d · (place − the same foot's place before),
 //!   step length, width = along and across d from the other foot's place before.                                    (1)
 //!
-//! Fails when: the person turns on the spot, or runs: toe-offs of runners come late by a tenth of the stride.
-//! Checked against synthetic walkers whose strikes, support and step width are known.
+//! Of walkers the stance comes out long by 1 to 3 % of the cycle, because both events are those of a foot that moves like the
+//! root; of runners by 15 to 20 %, so their tables have none (measured on synthetic people whose support is known).
+//! Fails when: the person turns on the spot.
+//! Checked against synthetic walkers whose strides, steps and support are known.
 
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 
@@ -254,24 +256,40 @@ mod tests {
         Clip { fps, poses: poses.collect(), offsets, hip_height_m: h }
     }
 
+    /// Where the heel of the left (0) or right (1) foot stands a phase of 0.15 after its strike in the first cycle.
+    fn stands(clip: &Clip, cycle: &Cycle, foot: usize) -> Vector2<f64> {
+        let phase = if foot == 0 { 0.65 } else { 0.15 };
+        let placed = clip.place(&pose_at(clip, phase * cycle.duration_s));
+        let ankle = LEGS[foot][2];
+        let heel = Vector3::new(0.0, -0.07, -0.06) * clip.hip_height_m;
+        ground(&(placed.position(ankle) + placed.world_from_node[ankle as usize] * heel))
+    }
+
     #[test]
     fn a_known_walker_has_the_known_table() {
         for (seed, speed) in [(1, 1.0), (4, 1.3), (7, 1.6)] {
             let subject = synthetic::subject(Activity::Walking, seed);
             let cycle = subject.mean_cycle(speed);
             for fps in [30.0, 120.0] {
-                let found = gait(&walk(&cycle, &subject, fps));
-                let table = found.table(true);
-                let both = |name: &str| table.iter().find(|l| l.name == name).unwrap().both.unwrap().mean;
+                let clip = walk(&cycle, &subject, fps);
+                let table = gait(&clip).table(true);
+                let line = |name: &str| table.iter().find(|l| l.name == name).unwrap();
+                let both = |name: &str| line(name).both.unwrap().mean;
+                let stride_m = speed * cycle.duration_s;
                 assert!((both("stride time") / cycle.duration_s - 1.0).abs() < 0.005, "{seed} {fps}");
                 assert!((both("cadence") * cycle.duration_s / 120.0 - 1.0).abs() < 0.005);
-                assert!((both("stride length") - speed * cycle.duration_s).abs() < 0.01, "{}", both("stride length"));
-                assert!((both("step length") - 0.5 * speed * cycle.duration_s).abs() < 0.01, "{}", both("step length"));
-                // Strikes are found up to 3 % early, and so is their mean distance to the toe-offs.
-                eprintln!("{seed} {speed} {fps}: stance {} width {}", both("stance"), both("step width"));
-                assert!((both("stance") + both("swing") - 1.0).abs() < 1e-12);
-                let step = table.iter().find(|l| l.name == "step length").unwrap();
-                assert!(step.asymmetry_percent().unwrap().abs() < 1.5, "{:?}", step);
+                assert!((both("speed") / speed - 1.0).abs() < 0.01 && (both("stride length") - stride_m).abs() < 0.01);
+                let to_left = stands(&clip, &cycle, 0) - stands(&clip, &cycle, 1);
+                for (side, length_m) in [to_left.y, stride_m - to_left.y].into_iter().enumerate() {
+                    let found = line("step length").sides[side].unwrap().mean;
+                    assert!((found - length_m).abs() < 0.012, "{seed} {fps} {side}: {found} {length_m}");
+                    let width = line("step width").sides[side].unwrap().mean;
+                    assert!((width - to_left.x).abs() < 0.012, "{seed} {fps} {side}: {width} {}", to_left.x);
+                }
+                // The share of the cycle that the synthetic walkers' feet stand.
+                let support = 0.752 - 0.143 / cycle.duration_s;
+                assert!((-0.005..0.04).contains(&(both("stance") - support)), "{seed} {fps}: {} {support}", both("stance"));
+                assert!((both("double support") - 2.0 * both("stance") + 1.0).abs() < 1e-9);
             }
         }
     }

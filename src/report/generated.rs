@@ -10,8 +10,8 @@ use super::style_charts::{against_parameter, clusters};
 use super::{ReportError, stick_figures};
 use crate::body::Clip;
 use crate::motion::Synthesis;
-use crate::motion_model::Model;
 use crate::motion_model::gait::{Gait, Measure, PERCENTS, cycle_angles, gait};
+use crate::motion_model::{Activity, Model};
 use crate::style::Style;
 
 /// Figures of one row of the chronophotograph, over this time.
@@ -107,7 +107,7 @@ impl GeneratedReport<'_> {
 
     /// Table over the motions, and the right leg's angles.
     fn gait(&self, gaits: &[Gait]) -> Markup {
-        let tables: Vec<_> = gaits.iter().map(|g| g.table(true)).collect();
+        let tables: Vec<_> = gaits.iter().map(|g| g.table(self.model.activity == Activity::Walking)).collect();
         let cell = |m: Option<Measure>, unit: &str| {
             m.map_or(
                 "\u{2013}".into(),

@@ -23,6 +23,7 @@ pub mod figures;
 pub mod generated;
 pub mod maps;
 pub mod marks;
+pub mod model;
 pub mod overlay;
 pub mod page;
 pub mod person;
@@ -38,7 +39,7 @@ pub mod walk;
 
 pub use calibration::calibration;
 pub use clouds::{CloudDot, cloud_and_body};
-pub use clusters::clusters;
+pub use clusters::{clusters, database_clusters};
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::{depth_map, person_depth};

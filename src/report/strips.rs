@@ -86,6 +86,7 @@ pub fn strips(rows: &[Strip], figures: usize, view: f64) -> Result<Drawing, Repo
     }
     let under = size[1] - 14.0;
     let cyclic = rows.iter().all(|r| r.cyclic);
+    marks.push(Mark::Text { at: [14.0, under], text: "phase".into(), capital_px: 9.0, colour: INK, align: Align::Left });
     for k in 0..figures {
         let at = [label_px + (k as f64 + 0.5) * place_px, under];
         let text = format!("{:.0} %", 100.0 * phase(k, figures, cyclic));

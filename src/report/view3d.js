@@ -64,12 +64,12 @@
       type: 'scatter3d', mode: 'lines', name, hoverinfo: 'name', line: { width: 7, color: colour(tone) }, ...bones(instant, side),
     });
     const all = [
-      { type: 'mesh3d', name: 'body', showlegend: true, hoverinfo: 'skip', opacity: 0.35, color: colour('--c6'), flatshading: false, ...body(instant) },
+      { type: 'mesh3d', name: 'body', showlegend: true, hoverinfo: 'skip', opacity: 0.2, color: colour('--c6'), lighting: { ambient: 0.9, diffuse: 0.2, specular: 0 }, ...body(instant) },
       line('left', 0, '--c0'), line('right', 1, '--c1'), line('trunk', 2, '--ink'),
     ];
     if (scene.instants.some(i => i.cloud.length > 0)) {
       all.push({
-        type: 'scatter3d', mode: 'markers', name: 'cloud', hoverinfo: 'skip', marker: { size: 1.8, color: colour('--c2') }, ...points(instant.cloud),
+        type: 'scatter3d', mode: 'markers', name: 'cloud', hoverinfo: 'skip', marker: { size: 2.2, color: colour('--c2') }, ...points(instant.cloud),
       });
     }
     return all;
@@ -86,6 +86,10 @@
     return [low / 1000 - 0.25, high / 1000 + 0.25];
   });
 
+  // Metres are as long in all directions, whatever the room's shape.
+  const lengths = room.map(([low, high]) => high - low), mean = Math.cbrt(lengths[0] * lengths[1] * lengths[2]);
+  const aspect = { x: lengths[0] / mean, y: lengths[1] / mean, z: lengths[2] / mean };
+
   function layout() {
     const axis = (name, k) => ({
       title: { text: name + ' (m)' }, range: room[k], color: colour('--soft'), gridcolor: colour('--line'), zeroline: false,
@@ -95,8 +99,9 @@
     return {
       margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: 'rgba(0,0,0,0)', font: { color: colour('--ink'), family: 'system-ui, sans-serif', size: 12 },
       legend: { orientation: 'h', x: 0, y: 1, bgcolor: 'rgba(0,0,0,0)' }, uirevision: 'same',
+      modebar: { bgcolor: 'rgba(0,0,0,0)', color: colour('--soft'), activecolor: colour('--ink') },
       scene: {
-        aspectmode: 'data', uirevision: 'same', xaxis: axis('x', 0), yaxis: axis('y', 1), zaxis: axis('z', 2),
+        aspectmode: 'manual', aspectratio: aspect, uirevision: 'same', xaxis: axis('x', 0), yaxis: axis('y', 1), zaxis: axis('z', 2),
         camera: { up: vector(scene.up), eye: vector(scene.eye) },
       },
     };

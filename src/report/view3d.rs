@@ -17,8 +17,8 @@ const FRAMES: usize = 24;
 const POINTS: usize = 400;
 /// Points farther from the root are no part of the person.
 const REACH_M: f64 = 1.3;
-/// Half the length of a primitive along its limb, of its semi-axis: neighbours stand one semi-axis apart.
-const ALONG: f64 = 0.75;
+/// Half the length of an ellipsoid along its limb, of the primitive's semi-axis, which is how far neighbours stand apart.
+const ALONG: f64 = 1.0;
 
 /// One instant.
 pub struct Instant<'a> {
@@ -95,7 +95,7 @@ fn scene(view: &View) -> Value {
 /// Above the horizon a little, at plotly's distance.
 fn eye(towards_viewer: &Vector3<f64>, up: &Vector3<f64>) -> [f64; 3] {
     let level = (towards_viewer - up * towards_viewer.dot(up)).try_normalize(1e-9).unwrap_or_else(|| up.yzx());
-    let eye = level * 2.1 + up * 0.4;
+    let eye = level * 1.75 + up * 0.35;
     [eye.x, eye.y, eye.z].map(|v| (v * 1000.0).round() / 1000.0)
 }
 

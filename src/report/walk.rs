@@ -129,7 +129,7 @@ fn angles(walk: &Walk, joint: usize) -> Markup {
         colour: *foot,
         band: Vec::new(),
     };
-    let toe_offs = (0..2).filter_map(|foot| {
+    let toe_offs = (0..2).filter(|_| walk.walks).filter_map(|foot| {
         let stance = walk.cycle.table(true).iter().find(|l| l.name == "stance")?.sides[foot]?.mean;
         Some((100.0 * stance, foot))
     });
@@ -141,7 +141,11 @@ fn angles(walk: &Walk, joint: usize) -> Markup {
         curves: vec![curve(0), curve(1)],
         faint: walk.strides.iter().map(stride).collect(),
         marks: toe_offs.collect(),
-        caption: "Fitted cycle with 95 % band; thin: strides of the footage; dotted: toe-off.".into(),
+        caption: if walk.walks {
+            "Fitted cycle with 95 % band; thin: strides of the footage; dotted: toe-off.".into()
+        } else {
+            "Fitted cycle with 95 % band; thin: strides of the footage.".into()
+        },
         ..Chart::default()
     }
     .figure()

@@ -63,6 +63,11 @@ impl Curve {
         self.spline.at(parameter)
     }
 
+    /// First and last parameter of the recordings.
+    pub fn range(&self) -> (f64, f64) {
+        self.spline.range()
+    }
+
     /// Parameters of the recordings, smallest first.
     pub fn parameters(&self) -> &[f64] {
         self.spline.knots()
@@ -171,6 +176,11 @@ impl Population {
 /// Mean motion vector of a knot's cycles.
 pub fn mean_vector(knot: &Knot) -> DVector<f64> {
     knot.members.iter().map(|m| &m.vector).sum::<DVector<f64>>() / knot.members.len() as f64
+}
+
+/// Mean root channels of a knot's cycles.
+pub fn mean_root(knot: &Knot) -> DVector<f64> {
+    knot.members.iter().map(|m| &m.root).sum::<DVector<f64>>() / knot.members.len() as f64
 }
 
 /// Least-squares slope of weighted points (share, parameter, weights); zero where the parameter does not vary.

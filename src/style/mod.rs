@@ -3,6 +3,7 @@
 //! Style paper §4, equations 4 to 8. `distance` holds (6) and (7), `curves` the database subjects over the parameter,
 //! `extrapolate` (8), `transfer` the default that keeps the own motion, `validate` the cross-validation of §5.2.
 
+pub mod angles;
 pub mod curves;
 pub mod distance;
 pub mod extrapolate;
@@ -20,7 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::body::Shape;
 use crate::motion_model::{Activity, Cycle, Detail, Member, Model};
-use curves::{Knot, knots, mean_vector};
+use curves::{Knot, knots, mean_root, mean_vector};
 
 /// How the weights at another parameter are found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,6 +90,22 @@ pub struct Observation {
 }
 
 impl Observation {
+    /// The mean of recorded cycles of one person.
+    pub fn of_knot(model: &Model, knot: &Knot) -> Observation {
+        let mean = |f: fn(&Member) -> f64| knot.members.iter().map(|m| f(m)).sum::<f64>() / knot.members.len() as f64;
+        let (vector, root) = (mean_vector(knot), mean_root(knot));
+        let weights = model.project(&vector);
+        let detail = Detail { vector: vector - model.vector(weights.as_slice()), root: root - model.root(weights.as_slice()) };
+        let law_hz = model.cadence().frequency_hz(knot.parameter, mean(|m| m.hip_height_m));
+        Observation {
+            parameter: knot.parameter,
+            weights: weights.as_slice().to_vec(),
+            covariance: None,
+            cadence_factor: 1.0 / (mean(|m| m.duration_s) * law_hz),
+            detail: Some(detail),
+        }
+    }
+
     /// Whether it holds `wanted` finite weights.
     fn check(&self, wanted: usize) -> Result<(), StyleError> {
         let found = self.weights.len();
@@ -113,6 +130,12 @@ impl Style {
             Method::Default => transfer(population, &self.observations(), parameter),
             Method::Paper(metric) => extrapolate(population, metric, &self.weights, self.parameter, parameter),
         }
+    }
+
+    /// With what was seen of the same person at other times; the first observation stays the main one.
+    pub fn and(mut self, other: Style) -> Style {
+        self.also.extend(other.observations());
+        self
     }
 
     /// All that was seen of the person.
@@ -170,20 +193,13 @@ impl Style {
         let members: Vec<Member> = cycles.iter().map(|c| model.member_of(c)).collect();
         let knots = knots(&members);
         let main = (0..knots.len()).max_by_key(|&k| (knots[k].members.len(), std::cmp::Reverse(k)))?;
-        let mut styles: Vec<Style> = knots.iter().map(|k| Style::of_knot(model, model_hash, k)).collect();
-        let first = styles.remove(main);
-        let also = styles.into_iter().flat_map(|s| s.observations()).collect();
-        Some(Style { also, ..first })
-    }
-
-    fn of_knot(model: &Model, model_hash: &str, knot: &Knot) -> Style {
-        let mean = |f: fn(&Member) -> f64| knot.members.iter().map(|m| f(m)).sum::<f64>() / knot.members.len() as f64;
-        let vector = mean_vector(knot);
-        let root = knot.members.iter().map(|m| &m.root).sum::<DVector<f64>>() / knot.members.len() as f64;
-        let weights = model.project(&vector);
-        let detail = Detail { vector: vector - model.vector(weights.as_slice()), root: root - model.root(weights.as_slice()) };
-        let frequency_hz = 1.0 / mean(|m| m.duration_s);
-        let style = Style::of_weights(model, model_hash, &weights, knot.parameter, mean(|m| m.hip_height_m), frequency_hz);
-        Style { detail: Some(detail), ..style }
+        let mut also: Vec<Observation> = knots.iter().map(|k| Observation::of_knot(model, k)).collect();
+        let first = also.remove(main);
+        let weights = DVector::from_vec(first.weights);
+        let n = cycles.len() as f64;
+        let hip_height_m = cycles.iter().map(|c| c.hip_height_m).sum::<f64>() / n;
+        let frequency_hz = first.cadence_factor * model.cadence().frequency_hz(first.parameter, hip_height_m);
+        let style = Style::of_weights(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
+        Some(Style { detail: first.detail, also, ..style })
     }
 }

@@ -218,3 +218,143 @@ fn notice(population: &Population, sparse: bool, observed: &[f64], s2: f64) -> O
     (population.lasting.pairs == 0)
         .then(|| "no three database subjects were recorded at two common parameters: the own deviation is kept whole".to_string())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::{BALL_JOINTS, DOF};
+    use crate::motion_model::{Activity, Member, Model, ROOT_CHANNELS, SAMPLES};
+    use nalgebra::UnitQuaternion;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    const GRID: [f64; 4] = [2.0, 3.0, 4.0, 5.0];
+    const SUBJECTS: usize = 40;
+    /// Coordinates that differ between people.
+    const WIDTH: usize = 30;
+
+    /// Motion vectors of people drawn from equation (1): a common curve and a deviation that grows and fades.
+    fn people(growth: f64, fade: f64) -> Vec<Member> {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut normal = || -> f64 { (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0 };
+        let mut members = Vec::new();
+        for subject in 0..SUBJECTS {
+            let mut d: Vec<f64> = (0..WIDTH).map(|_| normal()).collect();
+            for (k, s) in GRID.into_iter().enumerate() {
+                if k > 0 {
+                    let kept = (-fade * (s - GRID[k - 1])).exp();
+                    d.iter_mut().for_each(|d| *d = kept * *d + (1.0 - kept * kept).sqrt() * normal());
+                }
+                let mut vector = DVector::zeros(SAMPLES * DOF);
+                (0..WIDTH).for_each(|i| vector[i] = (growth * s).exp() * d[i] + 3.0 * (0.5 * s + i as f64).sin());
+                members.push(Member {
+                    subject: format!("{subject}"),
+                    source: String::new(),
+                    parameter: s,
+                    hip_height_m: 0.9,
+                    duration_s: 1.0,
+                    vector,
+                    root: DVector::zeros(SAMPLES * ROOT_CHANNELS),
+                });
+            }
+        }
+        members
+    }
+
+    fn model(members: &[Member]) -> Model {
+        Model::from_members(Activity::Running, false, [UnitQuaternion::identity(); BALL_JOINTS], members.to_vec()).unwrap()
+    }
+
+    fn observed(model: &Model, member: &Member) -> Observation {
+        let weights = model.member_weights(member).as_slice().to_vec();
+        Observation { parameter: member.parameter, weights, covariance: None, cadence_factor: 1.0, detail: None }
+    }
+
+    #[test]
+    fn the_populations_own_law_is_found() {
+        for (growth, fade) in [(0.15, 0.1), (0.0, 0.4), (0.1, 0.0)] {
+            let model = model(&people(growth, fade));
+            let found = Population::new(&model, model.basis.ncols()).lasting;
+            assert_eq!(found.pairs, 12 * SUBJECTS);
+            assert!((found.growth - growth).abs() < 0.04 && (found.fade - fade).abs() < 0.06, "{growth} {fade}: {found:?}");
+        }
+    }
+
+    /// For people of law (1) the prediction must beat both keeping the deviation whole and dropping it, with honest spread.
+    #[test]
+    fn people_never_seen_are_predicted_with_honest_spread() {
+        let all = people(0.15, 0.3);
+        let (known, new) = all.split_at(4 * (SUBJECTS - 10));
+        let model = model(known);
+        let population = Population::new(&model, model.basis.ncols());
+        let mut errors = [0.0; 3];
+        let (mut ratio, mut count) = (0.0, 0.0);
+        for person in new.chunks_exact(4) {
+            for (from, to) in (0..4).flat_map(|i| (0..4).map(move |k| (i, k))).filter(|(i, k)| i != k) {
+                let own = observed(&model, &person[from]);
+                let truth = model.member_weights(&person[to]);
+                let found = transfer(&population, std::slice::from_ref(&own), GRID[to]).unwrap();
+                assert!(found.notice.is_none());
+                let mean = |s: f64| -> DVector<f64> {
+                    population.curves.iter().map(|c| c.at(s)).sum::<DVector<f64>>() / population.curves.len() as f64
+                };
+                let kept = DVector::from_vec(own.weights.clone()) - mean(GRID[from]) + mean(GRID[to]);
+                for (sum, other) in errors.iter_mut().zip([&found.weights, &kept, &mean(GRID[to])]) {
+                    *sum += (other - &truth).norm_squared();
+                }
+                for (i, sd) in found.sd.unwrap().iter().enumerate() {
+                    ratio += ((found.weights[i] - truth[i]) / sd).powi(2);
+                    count += 1.0;
+                }
+            }
+        }
+        assert!(errors[0] < 0.85 * errors[1] && errors[0] < 0.85 * errors[2], "{errors:?}");
+        let ratio: f64 = f64::sqrt(ratio / count);
+        assert!((0.8..1.25).contains(&ratio), "errors are {ratio} of their deviations");
+    }
+
+    #[test]
+    fn two_observations_by_the_closed_form() {
+        let lasting = Lasting { growth: 0.0, fade: 0.5, scale: vec![], slope_variance: vec![], pairs: 1 };
+        // Between two observations of an Ornstein-Uhlenbeck process: sinh of the distances to the other end.
+        let (c, open) = lasting.prediction(&[2.0, 5.0], 4.0);
+        let sinh = |x: f64| (0.5 * x).sinh();
+        for (found, wanted) in c.iter().zip([sinh(1.0) / sinh(3.0), sinh(2.0) / sinh(3.0)]) {
+            assert!((found - wanted).abs() < 1e-5, "{c:?}");
+        }
+        assert!((open - 2.0 * sinh(1.0) * sinh(2.0) / sinh(3.0)).abs() < 1e-5, "{open}");
+        let lasting = Lasting { growth: 0.2, ..lasting };
+        let (c, _) = lasting.prediction(&[3.0], 5.0);
+        assert!((c[0] - (0.4f64 - 1.0).exp()).abs() < 1e-5);
+    }
+
+    #[test]
+    fn an_observed_parameter_comes_back_and_spread_widens_outside() {
+        let all = people(0.1, 0.2);
+        let model = model(&all[4..]);
+        let population = Population::new(&model, model.basis.ncols());
+        let own: Vec<Observation> = [0, 2].map(|k| observed(&model, &all[k])).into();
+        let at_seen = transfer(&population, &own, 4.0).unwrap();
+        assert!((&at_seen.weights - DVector::from_vec(own[1].weights.clone())).norm() < 1e-3);
+        let spread = |s: f64| -> f64 { transfer(&population, &own, s).unwrap().sd.unwrap().iter().map(|v| v * v).sum::<f64>().sqrt() };
+        assert!(spread(4.0) < 0.1 * spread(3.0) && spread(3.0) < spread(5.0));
+        assert!(spread(5.0) < 0.8 * spread(6.0) && spread(6.0) < 0.8 * spread(8.0), "{} {} {}", spread(5.0), spread(6.0), spread(8.0));
+        assert!(transfer(&population, &own, 6.0).unwrap().notice.unwrap().contains("nobody in the database was recorded at 6.00"));
+        let seen = Observation { covariance: Some(vec![vec![0.5, 0.0], vec![0.0, 0.1]]), ..own[1].clone() };
+        let sd = transfer(&population, &[seen], 4.0).unwrap().sd.unwrap();
+        assert!((sd[0] * sd[0] - 0.5).abs() < 1e-3 && (sd[1] * sd[1] - 0.1).abs() < 1e-3);
+    }
+
+    #[test]
+    fn without_common_parameters_the_deviation_is_kept_whole() {
+        let members: Vec<Member> = people(0.1, 0.2).into_iter().step_by(5).take(8).collect();
+        let model = model(&members);
+        let population = Population::new(&model, 2);
+        assert_eq!((population.lasting.pairs, population.lasting.growth, population.lasting.fade), (0, 0.0, 0.0));
+        let own = Observation { weights: vec![1.0, -2.0], ..observed(&model, &members[0]) };
+        let found = transfer(&population, &[own], 3.0).unwrap();
+        assert!(found.notice.is_some() && found.weights.iter().all(|w| w.is_finite()));
+        let bad = Observation { weights: vec![1.0], ..observed(&model, &members[0]) };
+        assert_eq!(transfer(&population, &[bad], 3.0).unwrap_err(), StyleError::Weights { found: 1, wanted: 2 });
+    }
+}

@@ -40,7 +40,7 @@ enum BatchCommand {
     },
     /// Where every session stands
     Status(PlaceArgs),
-    /// Writes summary.csv anew and fails where a session failed
+    /// Writes summary.csv and index.html anew and fails where a session failed
     Summary(PlaceArgs),
     #[command(hide = true)]
     Worker(session::WorkerArgs),

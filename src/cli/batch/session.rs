@@ -129,6 +129,9 @@ fn work(study: &Study, session: &StudySession, log: &File, threads: usize, begun
         return Ok(Some(Ended::Done(status)));
     }
     let reason = reason(log, exit, &study.log(&session.name));
+    // The row names the session already.
+    let folder = session.folder.display().to_string();
+    let reason = reason.replace(&format!("{folder}: "), "").replace(&format!("{folder}/"), "");
     let status = Status { state: State::Failed, reason: Some(reason), ..ended };
     status_json::write(&result, &status)?;
     std::fs::remove_dir_all(&work).with_context(|| format!("cannot remove {}", work.display()))?;

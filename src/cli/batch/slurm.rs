@@ -75,7 +75,7 @@ pub fn submit(study: &Study, sessions: &[StudySession], ask: &Ask) -> Result<()>
     }
     let list = new_list(&folder, &wanted)?;
     let tasks = wanted.len().min(max_array_size()?);
-    let memory_mb = ask.memory_mb.unwrap_or_else(|| memory_mb(study, &wanted));
+    let memory_mb = ask.memory_mb.unwrap_or_else(|| memory_mb(study, &wanted, ask.threads));
     let array = sbatch(&array_job(study, &list, tasks, memory_mb, ask))?;
     write_atomic(&list.with_extension("job"), format!("{array} {tasks}\n").as_bytes())?;
     let summary = sbatch(&summary_job(study, &list, &array))?;
@@ -132,25 +132,29 @@ fn max_array_size() -> Result<usize> {
 }
 
 /// Memory for one session: the most that any session of the study took, else an estimate from the pictures.
-fn memory_mb(study: &Study, wanted: &[&StudySession]) -> u32 {
+fn memory_mb(study: &Study, wanted: &[&StudySession], threads: usize) -> u32 {
     let all = study.sessions().unwrap_or_default();
     let done = all.iter().map(|s| study.status(s)).filter(|s| s.state == State::Done);
     let measured = done.filter_map(|s| s.peak_memory_mb).fold(0.0, f64::max);
-    let need = if measured > 0.0 { measured } else { wanted.par_iter().map(|s| estimate_mb(s)).reduce(|| BASE_MB, f64::max) };
+    let need = if measured > 0.0 { measured } else { wanted.par_iter().map(|s| estimate_mb(s, threads)).reduce(|| BASE_MB, f64::max) };
     ((HEADROOM * need / 100.0).ceil() * 100.0) as u32
 }
 
-/// Program, model and fit, 10⁶ bytes; measured on sessions of 10 frames of 160x120 px.
-const BASE_MB: f64 = 250.0;
-/// For every pixel of a camera: pictures, stage and matching of the frames in work; measured on 640x480.
-const BYTES_PER_PIXEL: f64 = 500.0;
-/// For every pixel of all frames: masks and their distance fields, and clouds.
-const BYTES_PER_FRAME_PIXEL: f64 = 3.0;
+// A session without any measured before it: 153 MB were seen for 10 frames of three 160x120 cameras with one thread, 245 MB for
+// 12 frames of three 640x480 cameras, 290 MB with two threads.
+/// Program, model and fit, 10⁶ bytes.
+const BASE_MB: f64 = 200.0;
+/// Bytes for every pixel of a camera: the stage, and what each thread has in work.
+const PER_PIXEL: f64 = 70.0;
+const PER_PIXEL_AND_THREAD: f64 = 50.0;
+/// Bytes for every pixel of every frame: masks, their distance fields and clouds.
+const PER_PIXEL_AND_FRAME: f64 = 4.0;
 
-fn estimate_mb(session: &StudySession) -> f64 {
+fn estimate_mb(session: &StudySession, threads: usize) -> f64 {
     let Ok((session, _)) = Session::open(&session.folder, None) else { return BASE_MB };
     let pixels: f64 = session.rig.cameras.iter().map(|c| f64::from(c.size_px[0]) * f64::from(c.size_px[1])).sum();
-    BASE_MB + 1e-6 * pixels * (BYTES_PER_PIXEL + BYTES_PER_FRAME_PIXEL * session.frame_count as f64)
+    let per_pixel = PER_PIXEL + PER_PIXEL_AND_THREAD * threads as f64 + PER_PIXEL_AND_FRAME * session.frame_count as f64;
+    BASE_MB + 1e-6 * pixels * per_pixel
 }
 
 /// Arguments of sbatch, and the script.

@@ -1,7 +1,9 @@
 //! What a batch says about its sessions: what would run, where each stands, and how the study ended.
 
-use anyhow::{Result, bail};
-use muybridge::io::status_json::{self, State, Status};
+use anyhow::{Context, Result, bail};
+use muybridge::io::status_json::{self, COLUMNS, State, Status};
+use muybridge::io::write_atomic;
+use muybridge::report;
 use rayon::prelude::*;
 
 use super::study::{Plan, Study, StudySession};
@@ -68,10 +70,33 @@ fn counts(statuses: &[Status]) -> String {
     format!("{} sessions: {}", statuses.len(), some.join(", "))
 }
 
-/// Writes summary.csv of all sessions, prints counts and failures; an error where a chosen session failed or is not done.
+/// The columns of summary.csv that the page shows.
+const SHOWN: std::ops::Range<usize> = 3..8;
+
+/// Writes the study's page.
+fn write_page(study: &Study, statuses: &[Status]) -> Result<()> {
+    let values: Vec<Vec<String>> = statuses.iter().map(|s| status_json::row(&study.results, s)[SHOWN].to_vec()).collect();
+    let reports: Vec<String> = statuses.iter().map(|s| format!("{}/report.html", s.session)).collect();
+    let thumbnails: Vec<_> = statuses.iter().map(|s| std::fs::read(study.result(&s.session).join("thumbnail.jpg")).ok()).collect();
+    let rows = statuses.iter().enumerate().map(|(i, status)| report::study::StudyRow {
+        session: &status.session,
+        state: status.state.name(),
+        reason: status.reason.as_deref(),
+        report: study.results.join(&reports[i]).exists().then_some(reports[i].as_str()),
+        thumbnail: thumbnails[i].as_deref(),
+        values: values[i].clone(),
+    });
+    let title = study.folder.file_name().unwrap_or_default().to_string_lossy();
+    let page = report::study::Study { title: &title, columns: COLUMNS[SHOWN].to_vec(), rows: rows.collect() };
+    let path = study.results.join("index.html");
+    write_atomic(&path, report::study::html(&page).as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Writes summary.csv and index.html of all sessions, prints counts and failures; an error where a chosen session failed or is not done.
 pub fn summarise(study: &Study, all: &[StudySession], chosen: &[StudySession]) -> Result<()> {
     let mut statuses: Vec<Status> = all.iter().map(|s| study.status(s)).collect();
     status_json::write_summary(&study.results, &statuses)?;
+    write_page(study, &statuses)?;
     statuses.retain(|status| chosen.iter().any(|s| s.name == status.session));
     println!("{}, in {}", counts(&statuses), study.results.display());
     let failed: Vec<&Status> = statuses.iter().filter(|s| s.state == State::Failed).collect();

@@ -29,8 +29,8 @@ const WIDE: f64 = 20.0;
 const NARROW: f64 = 3.0;
 /// A longer time without a pelvis ends the part to use, seconds.
 const LONGEST_GAP_S: f64 = 0.25;
-/// Median distance of markers to the body beyond which the names or the set are wrong, metres.
-const NO_BODY_M: f64 = 0.05;
+/// Share of markers let go beyond which the names or the set are wrong.
+const NO_BODY: f64 = 0.15;
 /// A marker farther from its place is counted as let go, metres.
 const LET_GO_M: f64 = 0.1;
 
@@ -38,6 +38,8 @@ const LET_GO_M: f64 = 0.1;
 pub enum IkError {
     #[error("no frame shows the set's markers at different heights")]
     Empty,
+    #[error("one frame is no motion; two with the pelvis in sight are the least")]
+    OneFrame,
     #[error("the body does not stand along an axis of the file; the first frames of a recording must show a standing person")]
     Lying,
     #[error("the markers span a person of {size:.3} units, which is no human size in m, cm or mm; correct the file's unit of length")]
@@ -47,9 +49,9 @@ pub enum IkError {
     )]
     NoPelvis { set: String },
     #[error(
-        "half of the markers are farther than {median_m:.2} m from any body: left and right or other names are exchanged, or {set} is not the set used"
+        "{percent:.0} % of the markers are farther than {LET_GO_M} m from a body that fits the others: left and right or other names are exchanged, or {set} is not the set used"
     )]
-    NoBody { median_m: f64, set: String },
+    NoBody { percent: f64, set: String },
 }
 
 /// A recording's motion.
@@ -70,6 +72,9 @@ pub struct Solved {
 
 /// Finds body size, marker offsets and poses; `matches` as [`choose`](super::choose) gives them.
 pub fn solve(markers: &Markers, set: &MarkerSet, matches: &[Match]) -> Result<Solved, IkError> {
+    if markers.frames.len() < 2 {
+        return Err(IkError::OneFrame);
+    }
     let upright = start::upright(markers, set, matches)?;
     let person = Person::new(set, matches, upright.stature_m);
     let nominal = person.rest(0).offsets;
@@ -80,9 +85,9 @@ pub fn solve(markers: &Markers, set: &MarkerSet, matches: &[Match]) -> Result<So
     let (first_frame, frames, roots) = (*run.start(), &upright.frames[run.clone()], &roots[run]);
     let learnt = learn(&person, frames, roots, 1.0 / markers.fps);
     let state = all_frames(&person, frames, &learnt, 1.0 / markers.fps);
-    let (rms_m, let_go, median_m) = misfit(&person, frames, &state);
-    if median_m > NO_BODY_M {
-        return Err(IkError::NoBody { median_m, set: set.name.clone() });
+    let (rms_m, let_go) = misfit(&person, frames, &state);
+    if let_go > NO_BODY {
+        return Err(IkError::NoBody { percent: 100.0 * let_go, set: set.name.clone() });
     }
     let mut notices = upright.notices;
     if frames.len() < markers.frames.len() {
@@ -145,8 +150,8 @@ fn all_frames(person: &Person, frames: &Frames, learnt: &(State, usize), frame_s
     State { poses: poses.into_iter().flatten().collect(), ..start }
 }
 
-/// R.m.s. distance of the markers held, share of those let go, median distance of all.
-fn misfit(person: &Person, frames: &Frames, state: &State) -> (f64, f64, f64) {
+/// R.m.s. distance of the markers held, share of those let go.
+fn misfit(person: &Person, frames: &Frames, state: &State) -> (f64, f64) {
     let offsets = state.shape.offsets();
     let of_frame = |(frame, pose): (&Vec<Option<Vector3<f64>>>, &Pose)| {
         let placed = place(&offsets, pose);
@@ -156,8 +161,7 @@ fn misfit(person: &Person, frames: &Frames, state: &State) -> (f64, f64, f64) {
     let distances: Vec<f64> = frames.iter().zip(&state.poses).flat_map(of_frame).collect();
     let held: Vec<f64> = distances.iter().copied().filter(|d| *d <= LET_GO_M).collect();
     let rms_m = (held.iter().map(|d| d * d).sum::<f64>() / held.len().max(1) as f64).sqrt();
-    let let_go = 1.0 - held.len() as f64 / distances.len().max(1) as f64;
-    (rms_m, let_go, crate::math::order::quantile(distances, 0.5).unwrap_or(f64::INFINITY))
+    (rms_m, 1.0 - held.len() as f64 / distances.len().max(1) as f64)
 }
 
 /// The same placement of all nodes but the elbows, with the twist about the forearm at the wrist.

@@ -398,7 +398,7 @@ mod tests {
             let seen = |f: usize, i: usize| {
                 let outlier = if (f, i) == (1, 4) { Vector3::new(0.2, -0.1, 0.0) } else { Vector3::zeros() };
                 let noise = Vector3::from_fn(|k, _| noise[9 * i + 3 * f + k]);
-                ((f + i) % 7 != 0).then(|| person.position(&state, &placed[f], i) + (noise + outlier) * size)
+                (!(f + i).is_multiple_of(7)).then(|| person.position(&state, &placed[f], i) + (noise + outlier) * size)
             };
             let frames: Vec<Vec<Option<Vector3<f64>>>> = (0..3).map(|f| (0..matches.len()).map(|i| seen(f, i)).collect()).collect();
             let problem = problem_of(&person, &frames);

@@ -67,8 +67,8 @@ fn bicubic(image: &GrayImage, x: f32, y: f32) -> f32 {
             true => *image.as_raw()[(top as usize + j) * width + left as usize..].first_chunk::<4>().unwrap_or(&[0; 4]),
             false => border_row(image, left, top + j as isize),
         };
-        for i in 0..4 {
-            sums[i] += weight * f32::from(taps[i]);
+        for (sum, tap) in sums.iter_mut().zip(taps) {
+            *sum += weight * f32::from(tap);
         }
     }
     let weights = catmull_rom(x - x0);
