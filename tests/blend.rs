@@ -30,24 +30,21 @@ fn cycles(path: &Path, part_s: Option<(f64, f64)>) -> Vec<Cycle> {
     segment(&clip, &label).map(|s| s.cycles).unwrap_or_default()
 }
 
-/// Ankles (left, right) against the root, forward and up in metres, for a body of 1.75 m.
-fn ankles((joints, root): &Posture) -> [[f64; 2]; 2] {
+/// Ankles (left, right) ahead of the root in metres, for a body of 1.75 m.
+fn ankles((joints, root): &Posture) -> [f64; 2] {
     let shape = Shape::template(1.75);
     let pose = Pose { root: Vector3::zeros(), world_from_root: exp(&root.rotation), joints: *joints };
     let placed = place(&shape.offsets(), &pose);
-    [Joint::LAnkle, Joint::RAnkle].map(|j| [placed.position(j).z, placed.position(j).y])
+    [Joint::LAnkle, Joint::RAnkle].map(|j| placed.position(j).z)
 }
 
-/// Times, as parts of the cycle, when the left and the right ankle are farthest ahead and farthest behind: strikes and
-/// toe-offs, read from positions and not from any warp. The right strike is sought about the cycle's start.
-fn events(posture: &dyn Fn(f64) -> Posture) -> [f64; 4] {
+/// Times, as parts of the cycle, when the left and the right ankle are farthest ahead: strikes, read from positions and not from
+/// any warp.
+fn strikes(posture: &dyn Fn(f64) -> Posture) -> [f64; 2] {
     const FINE: usize = 1000;
-    let at: Vec<[[f64; 2]; 2]> = (0..FINE).map(|k| ankles(&posture(k as f64 / FINE as f64))).collect();
-    let extreme = |side: usize, sign: f64| {
-        let ahead = |k: usize| sign * at[k][side][0];
-        (0..FINE).max_by(|&a, &b| ahead(a).total_cmp(&ahead(b))).unwrap() as f64 / FINE as f64
-    };
-    [extreme(0, 1.0), extreme(1, 1.0), extreme(0, -1.0), extreme(1, -1.0)]
+    let at: Vec<[f64; 2]> = (0..FINE).map(|k| ankles(&posture(k as f64 / FINE as f64))).collect();
+    let farthest = |side: usize| (0..FINE).max_by(|&a, &b| at[a][side].total_cmp(&at[b][side])).unwrap();
+    [0, 1].map(|side| farthest(side) as f64 / FINE as f64)
 }
 
 /// The smallest difference of two parts of a cycle.
@@ -88,7 +85,7 @@ fn walks_at_different_speeds_meet_at_their_heel_strikes() {
             let options = Options { reference: Some("slow".into()), ..Options::default() };
             let space = Space::build(&[Example::of_cycle("slow", &slow), other], &options).unwrap();
             let [a, b] = [0, 1].map(|m| space.play(&space.members[m].vectors));
-            let [own, others] = [&a, &b].map(|blend| events(&|t| blend.posture(t)));
+            let [own, others] = [&a, &b].map(|blend| strikes(&|t| blend.posture(t)));
             for strike in 0..2 {
                 // The reference's strike, carried into the other's time.
                 let carried = b.time_phase(a.shape_phase(own[strike]));
@@ -134,7 +131,7 @@ fn stylised() -> Vec<(&'static str, Vec<Example>)> {
     if let Some(bandai) = mocap("bandai-namco-1/data") {
         let mut files: Vec<_> = std::fs::read_dir(bandai).unwrap().map(|e| (e.unwrap().path(), None)).collect();
         files.retain(|f| f.0.to_string_lossy().contains("_walk_"));
-        files.sort();
+        files.sort_by(|a: &(PathBuf, _), b| a.0.cmp(&b.0));
         sets.push(("dataset-1_walk_happy_001", examples(files)));
     }
     sets
@@ -223,7 +220,7 @@ fn walkers() -> tempfile::TempDir {
     let shape = Shape::template(1.75);
     for seed in 1..5u64 {
         let cycle = muybridge::motion_model::synthetic::subject(Activity::Walking, seed).cycle(0.8 + 0.2 * seed as f64, 0);
-        let clip = muybridge::motion::play_cycle(&cycle, &shape.offsets(), 100.0, muybridge::motion::Length::Cycles(3));
+        let clip = muybridge::motion::play_cycle(&cycle, &shape.offsets(), 100.0, muybridge::motion::Length::Cycles(4));
         muybridge::io::bvh::write_clip(&dir.path().join(format!("w{seed}.bvh")), &clip, None).unwrap();
     }
     std::fs::write(dir.path().join("labels.csv"), "file,pace\nw1,1\nw2.bvh,2\nw3,3\nw4#1,4\n").unwrap();
@@ -237,10 +234,10 @@ fn the_command_builds_mixes_and_changes() {
     let (space, labels) = (at("space.npz"), at("labels.csv"));
     let files: Vec<String> = (1..5).map(|k| at(&format!("w{k}.bvh"))).collect();
     let build: Vec<&str> = ["blend", "build"].into_iter().chain(files.iter().map(String::as_str)).collect();
-    let (done, said, error) = run(&[&build[..], &["--labels", &labels, "-o", &space]].concat());
+    let (done, said, error) = run(&[&build[..], &["--labels", &labels, "-o", &space][..]].concat());
     assert!(done && said.contains("attribute pace") && said.contains("w4: "), "{said}{error}");
     let bytes = std::fs::read(&space).unwrap();
-    run(&[&["--threads", "1"], &build[..], &["--labels", &labels, "-o", &space]].concat());
+    run(&[&["--threads", "1"][..], &build[..], &["--labels", &labels, "-o", &space][..]].concat());
     assert!(std::fs::read(&space).unwrap() == bytes, "the same bytes with one thread");
 
     let cell = |out: &str, row: usize, column: usize| {
@@ -288,7 +285,7 @@ fn what_cannot_be_done_is_said_in_one_sentence() {
     assert!(run(&["blend", "build", &at("w1.bvh"), &at("w2.bvh"), &at("w3.bvh"), "-o", &space]).0);
     std::fs::write(dir.path().join("wrong.csv"), "file,mood\nw9,1\n").unwrap();
     let out = at("out");
-    let (w1, w2, wrong) = (at("w1.bvh"), at("w2.bvh"), at("wrong.csv"));
+    let (w1, w2, wrong, none) = (at("w1.bvh"), at("w2.bvh"), at("wrong.csv"), at("none.bvh"));
     let cases: [(&[&str], &str); 9] = [
         (&["build", &w1, &w2, "--labels", &wrong, "-o", &out], "line 2: `w9` is no motion"),
         (&["build", &w1, &w2, "--activity", "jumping", "-o", &out], "at least two"),
@@ -297,11 +294,11 @@ fn what_cannot_be_done_is_said_in_one_sentence() {
         (&["mix", &space, "--shape", "w1=1,w2=-1", "-o", &out], "add up to"),
         (&["attribute", &space, "grace", "-o", &out], "no attribute `grace`; it has hand-height, energy"),
         (&["attribute", &space, "energy", "--by", "1,1", "-o", &out], "+1 is asked for twice"),
-        (&["caricature", &space, "--of", &at("none.bvh"), "-o", &out], "none.bvh"),
+        (&["caricature", &space, "--of", &none, "-o", &out], "none.bvh"),
         (&["info", &w1], "no space of motions"),
     ];
     for (arguments, part) in cases {
-        let (done, _, error) = run(&[&["blend"], arguments].concat());
+        let (done, _, error) = run(&[&["blend"][..], arguments].concat());
         let last = error.lines().last().unwrap_or_default();
         assert!(!done && last.starts_with("error: ") && last.contains(part), "{arguments:?}: {error}");
         assert!(!Path::new(&out).exists(), "{arguments:?}");
