@@ -16,13 +16,13 @@
 //! use muybridge::body::Shape;
 //! use muybridge::motion::{Length, play, synthesize};
 //! use muybridge::motion_model::{Activity, Model, synthetic};
-//! use muybridge::style::{Metric, Population, Style};
+//! use muybridge::style::{Method, Population, Style};
 //!
 //! let model = Model::build(Activity::Running, true, &synthetic::database(Activity::Running))?;
 //! let filmed = [synthetic::subject(Activity::Running, 100).cycle(2.5, 0)];
 //! let style = Style::of_cycles(&model, "", &filmed).ok_or("no cycles")?;
-//! let population = Population::new(&model, model.components(0.95));
-//! let faster = synthesize(&model, &population, Metric::Paper, &style, 3.0, style.hip_height_m)?;
+//! let population = Population::new(&model, style.weights.len());
+//! let faster = synthesize(&model, &population, Method::Default, &style, 3.0, style.hip_height_m)?;
 //! let clip = play(&model, &faster, &Shape::template(1.75).offsets(), 60.0, Length::Seconds(2.0));
 //! let way = clip.poses[clip.poses.len() - 1].root - clip.poses[0].root;
 //! assert!((way.z / 2.0 - 3.0).abs() < 0.1, "three metres per second");

@@ -8,7 +8,7 @@ use muybridge::body::Shape;
 use muybridge::io::{bvh, calib_toml};
 use muybridge::motion::{Length, play, synthesize};
 use muybridge::motion_model::{Activity, Model, synthetic};
-use muybridge::style::{Metric, Population, Style};
+use muybridge::style::{Method, Population, Style};
 
 fn run(arguments: &[&str]) {
     let output = Command::cargo_bin("muybridge").unwrap().args(arguments).output().unwrap();
@@ -44,7 +44,7 @@ fn recordings(folder: &Path, people: &[u64], speeds_m_s: &[f64]) {
         for speed_m_s in speeds_m_s {
             let cycle = synthetic::subject(Activity::Walking, *person).cycle(*speed_m_s, 0);
             let style = Style::of_cycles(&model, "", &[cycle]).unwrap();
-            let synthesis = synthesize(&model, &population, Metric::Paper, &style, *speed_m_s, shape.hip_height_m()).unwrap();
+            let synthesis = synthesize(&model, &population, Method::Default, &style, *speed_m_s, shape.hip_height_m()).unwrap();
             let clip = play(&model, &synthesis, &shape.offsets(), 60.0, Length::Cycles(4));
             bvh::write_clip(&folder.join(format!("p{person}/walk_{speed_m_s:.1}.bvh")), &clip, None).unwrap();
         }

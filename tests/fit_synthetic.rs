@@ -7,7 +7,7 @@ use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
 use muybridge::fit::state::{Carrier, State, Turns};
-use muybridge::fit::{FitOptions, Journal, Observation, Watch, fit, resume};
+use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, resume};
 use muybridge::math::arrow::{LmOptions, minimise};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{Figure, SightOptions, joint_errors, sighting, staging};
@@ -90,9 +90,10 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
     let observations: Vec<Observation> = true_poses.par_iter().enumerate().map(observe).collect();
     let floor = true_poses.iter().map(|p| staging::lowest_m(&surface, &place(&offsets, p), rig.up)).fold(f64::INFINITY, f64::min);
     let options = FitOptions { components: 8, ..FitOptions::default() };
-    let (key, journals) = ([5; 32], std::cell::RefCell::new(Vec::new()));
-    let watch = Watch { progress: &|_| true, keep: &|journal| journals.borrow_mut().push(journal.to_bytes(&key)) };
-    let found = resume(&observations, &rig, &model, Some(floor), &options, Journal::default(), &watch).unwrap();
+    let kept = std::cell::RefCell::new(Vec::new());
+    let keep = |stage: usize, at: &Checkpoint| kept.borrow_mut().push((stage, at.clone()));
+    let watched = Checkpoints { load: &|_| None, save: &keep };
+    let found = resume(&observations, &rig, &model, Some(floor), &options, &watched, &|_| true).unwrap();
     let errors = joint_errors(&positions(&found.state, &found.poses), &positions(&truth, &true_poses));
     assert!(errors.absolute_m < 0.012 && errors.swapped_over_straight > 3.0, "{errors:?}");
     for (a, b) in found.state.carriers.iter().zip(&truth.carriers) {
@@ -101,12 +102,12 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
         assert!(a.world_from_carrier.angle_to(&b.world_from_carrier) < 0.08);
     }
     // Stopped late and taken up again, it ends as if nothing had been.
-    let journals = journals.into_inner();
-    let late = Journal::from_bytes(&journals[journals.len() * 9 / 10], &key).unwrap();
-    let iterations = std::cell::Cell::new(0);
-    let watch = Watch { progress: &|_| true, keep: &|_| iterations.set(iterations.get() + 1) };
-    let again = resume(&observations, &rig, &model, Some(floor), &options, late, &watch).unwrap();
-    assert!(iterations.get() > 0 && iterations.get() < journals.len() / 5 + 1, "{} of {}", iterations.get(), journals.len());
+    let kept = kept.into_inner();
+    let until = &kept[..kept.len() * 9 / 10];
+    let (last, more) = (|stage: usize| until.iter().rev().find(|k| k.0 == stage).map(|k| k.1.clone()), std::cell::Cell::new(0));
+    let again = Checkpoints { load: &last, save: &|_, _| more.set(more.get() + 1) };
+    let again = resume(&observations, &rig, &model, Some(floor), &options, &again, &|_| true).unwrap();
+    assert!(more.get() > 0 && more.get() < kept.len() / 5 + 1, "{} of {}", more.get(), kept.len());
     assert_eq!(format!("{:?} {:?}", again.state, again.iterations), format!("{:?} {:?}", found.state, found.iterations));
     // One standard deviation each: a fit that says nothing would be off by 1.
     let off = |i: usize| (found.state.weights[i] - truth.weights[i]) / curve.eigenvalues[i].sqrt();

@@ -355,7 +355,7 @@ impl<'a> Run<'a> {
         let reach = |px: f32| reach_px(mask, px) as u32;
         let inner = erode(mask, reach(6.0));
         let noise = noise(&maps.change);
-        let (near, far) = (dilate(mask, reach(3.0)), box_vote(mask, i64::from(reach(30.0)), 0.0));
+        let (near, far) = (dilate(mask, reach(3.0)), box_vote(mask, reach(30.0) as usize, 0.0));
         let colours =
             |wanted: &dyn Fn(usize) -> bool| -> Vec<[f32; 3]> { (0..maps.lab.len()).filter(|i| wanted(*i)).map(|i| maps.lab[i]).collect() };
         let inside = colours(&|i| inner.as_raw()[i] > 0 || (mask.as_raw()[i] > 0 && maps.change[i] > 2.5 * noise));

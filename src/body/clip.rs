@@ -28,23 +28,27 @@ impl Clip {
         0.5 * [LKnee, LAnkle, RKnee, RAnkle].map(|j| self.offsets[j as usize].norm()).iter().sum::<f64>()
     }
 
-    /// World height of the lowest point of both soles, metres: heel, ball and toe tip of flat feet whose ankles stand
-    /// `hip_height_m − leg_m` above the floor.
+    /// World height of the lowest point of both soles, metres.
     pub fn sole_height(&self, pose: &Pose) -> f64 {
         let placed = self.place(pose);
+        let points = [Joint::LAnkle, Joint::RAnkle].into_iter().flat_map(|ankle| self.sole_points(&placed, ankle));
+        points.map(|p| p.y).fold(f64::INFINITY, f64::min)
+    }
+
+    /// Heel, ball and toe tip under the foot of `ankle` (LAnkle or RAnkle) in the world, metres: on the floor for flat feet
+    /// whose ankles stand `hip_height_m − leg_m` above it.
+    pub fn sole_points(&self, placed: &Placement, ankle: Joint) -> [Vector3<f64>; 3] {
+        let ball = if ankle == Joint::LAnkle { Joint::LMidtarsal } else { Joint::RMidtarsal };
         let ankle_height = self.hip_height_m - self.leg_m();
-        [(Joint::LAnkle, Joint::LMidtarsal), (Joint::RAnkle, Joint::RMidtarsal)]
-            .into_iter()
-            .flat_map(|(ankle, ball)| {
-                let to_ball = self.offsets[ball as usize];
-                let ball_height = ankle_height + to_ball.y;
-                let toes = self.end_site(ball).map_or(0.0, |end| end.z);
-                let heel = Vector3::new(0.0, -ankle_height, -0.5 * to_ball.z);
-                let under =
-                    |joint: Joint, point: Vector3<f64>| placed.position(joint).y + (placed.world_from_node[joint as usize] * point).y;
-                [under(ankle, heel), under(ball, Vector3::new(0.0, -ball_height, 0.0)), under(ball, Vector3::new(0.0, -ball_height, toes))]
-            })
-            .fold(f64::INFINITY, f64::min)
+        let to_ball = self.offsets[ball as usize];
+        let ball_height = ankle_height + to_ball.y;
+        let toes = self.end_site(ball).map_or(0.0, |end| end.z);
+        let under = |joint: Joint, point: Vector3<f64>| placed.position(joint) + placed.world_from_node[joint as usize] * point;
+        [
+            under(ankle, Vector3::new(0.0, -ankle_height, -0.5 * to_ball.z)),
+            under(ball, Vector3::new(0.0, -ball_height, 0.0)),
+            under(ball, Vector3::new(0.0, -ball_height, toes)),
+        ]
     }
 
     /// [`Joint::end_site`] in metres, scaled like the segment before it.

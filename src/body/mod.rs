@@ -1,6 +1,7 @@
 //! The body: skeleton of 26 ball joints (78 DOF), pose and forward kinematics, shape, implicit surface, motion clip.
 
 pub mod clip;
+pub mod mesh;
 pub mod pose;
 pub mod shape;
 pub mod skeleton;

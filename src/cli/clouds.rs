@@ -37,7 +37,7 @@ pub fn run(args: &CloudsArgs) -> Result<()> {
     let rig = CloudRig::new(&session.rig, Some(&stage), &options).with_context(|| format!("the rig of {}", args.session.display()))?;
     let partial = whole::beside(&args.output)?;
     let (mut points, mut seen) = (0, 0);
-    observe(&session, &rig, &options, |frame, found| {
+    observe(&session, &rig, &options, None, |frame, found| {
         write_ply(&partial.path().join(format!("{:06}.ply", frame.number)), &found.cloud)?;
         points += found.cloud.points.len();
         seen += usize::from(!found.cloud.points.is_empty());

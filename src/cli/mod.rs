@@ -1,6 +1,8 @@
 //! One file per subcommand: load, call the library, save, report.
 mod animal;
+mod batch;
 mod bench;
+mod blend;
 mod board;
 mod calibrate;
 mod check;
@@ -12,6 +14,8 @@ mod interrupt;
 mod model;
 mod motions;
 mod observe;
+mod outputs;
+mod profile;
 mod progress;
 mod render;
 mod rig;
@@ -52,8 +56,13 @@ enum Command {
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
     Generate(generate::GenerateArgs),
+    /// Motions in a vector space: mixed, with less or more of an attribute, caricatured, varied
+    #[command(subcommand)]
+    Blend(blend::BlendCommand),
     /// A session's footage to the person's motion, style and size
     Track(track::TrackArgs),
+    /// Every session of a study, whatever breaks on the way; results that are there already are kept
+    Batch(batch::BatchArgs),
     /// From one video of an animal to its motion
     #[command(subcommand)]
     Animal(animal::AnimalCommand),
@@ -82,6 +91,7 @@ pub fn run(cli: Cli) -> Result<()> {
     interrupt::catch();
     match cli.command {
         Command::Demo(args) => demo::run(&args),
+        Command::Batch(args) => batch::run(&args, cli.threads),
         Command::Check(args) => check::run(&args),
         Command::Calibrate(args) => calibrate::run(&args),
         Command::Clouds(args) => clouds::run(&args),
@@ -93,7 +103,14 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
         Command::Generate(args) => generate::run(args),
+        Command::Blend(command) => blend::run(command),
     }
+}
+
+/// This program, also when its file was replaced since it began.
+fn executable() -> std::path::PathBuf {
+    let running = std::path::Path::new("/proc/self/exe");
+    if running.exists() { running.to_path_buf() } else { std::env::current_exe().unwrap_or_else(|_| "muybridge".into()) }
 }
 
 fn positive(text: &str) -> Result<f64, String> {

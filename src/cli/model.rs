@@ -1,4 +1,4 @@
-//! `muybridge model`: build, synthetic, info, validate.
+//! `muybridge model`: build, update, synthetic, info, validate.
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -8,10 +8,11 @@ use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model, write_model};
 use muybridge::io::write_atomic;
 use muybridge::motion_model::{Activity, Model, database, synthetic};
+use muybridge::report;
 use muybridge::report::validation::ValidationReport;
-use muybridge::style::validate::{Score, validate};
+use muybridge::style::validate::{METRICS, Score, validate};
 
-use super::motions::{ActivityName, exclude, file_name, read_recordings};
+use super::motions::{ActivityName, TABLE, exclude, file_name, read_recordings};
 
 /// Components whose share of the variance is printed.
 const SHOWN_COMPONENTS: usize = 20;
@@ -22,10 +23,15 @@ pub enum ModelCommand {
     Build(BuildArgs),
     /// Write the embedded synthetic database as a model
     Synthetic(SyntheticArgs),
+    /// A model with further recordings, without those it was built from
+    Update(UpdateArgs),
     /// Subjects, parameters and explained variance of a model
     Info {
         /// Model file (.npz)
         model: PathBuf,
+        /// Folder for pictures: variance held, the subjects' clusters, weights over the parameter
+        #[arg(short, long, value_name = "DIR")]
+        output: Option<PathBuf>,
     },
     /// Leave-one-subject-out validation
     Validate(ValidateArgs),
@@ -33,7 +39,7 @@ pub enum ModelCommand {
 
 #[derive(Args)]
 pub struct BuildArgs {
-    /// Motion files (.bvh, .amc, .mot) or folders, searched to the bottom
+    /// Motion files (.bvh, .amc, .c3d, .trc, .mot) or folders, searched to the bottom
     #[arg(required = true, value_name = "MOCAP")]
     inputs: Vec<PathBuf>,
     /// Table of the files: file,subject,activity,speed_m_s or length_m,start_s,end_s
@@ -44,8 +50,35 @@ pub struct BuildArgs {
     exclude: Vec<String>,
     #[arg(long)]
     activity: ActivityName,
+    /// Table (CSV) of what was found in every file: cycles, speed, duration, and why anything was left out
+    #[arg(long, value_name = "FILE")]
+    table: Option<PathBuf>,
+    /// Components that the file keeps, for less detail at less cost; those that hold 99 % of the variance without it
+    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u16).range(1..))]
+    components: Option<u16>,
     /// Model file to write
     #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+#[derive(Args)]
+pub struct UpdateArgs {
+    /// Model file (.npz); stays as it is
+    model: PathBuf,
+    /// Motion files or folders of the model's activity
+    #[arg(required = true, value_name = "MOCAP")]
+    inputs: Vec<PathBuf>,
+    /// Table of the files: file,subject,activity,speed_m_s or length_m,start_s,end_s
+    #[arg(long, value_name = "FILE")]
+    manifest: Option<PathBuf>,
+    /// Subject or trial to leave out; repeat for several
+    #[arg(long, value_name = "SUBJECT or TRIAL")]
+    exclude: Vec<String>,
+    /// Components that the file keeps; those that hold 99 % of the variance without it
+    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u16).range(1..))]
+    components: Option<u16>,
+    /// Model file to write
+    #[arg(short, long, value_name = "NEW")]
     output: PathBuf,
 }
 
@@ -62,7 +95,7 @@ pub struct SyntheticArgs {
 pub struct ValidateArgs {
     /// Model file (.npz)
     model: PathBuf,
-    /// Folder for validation.csv
+    /// Folder for validation.csv, degrees.csv (every angle) and two pictures
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Part of the variance that the components in use hold; 0.90 for walking, else 0.95
@@ -74,9 +107,11 @@ pub fn run(command: ModelCommand) -> Result<()> {
     match command {
         ModelCommand::Build(args) => build(args),
         ModelCommand::Synthetic(args) => write_synthetic(args),
-        ModelCommand::Info { model } => {
-            print!("{}", description(&model, &read_model(&model)?));
-            Ok(())
+        ModelCommand::Update(args) => update(args),
+        ModelCommand::Info { model: path, output } => {
+            let model = read_model(&path)?;
+            print!("{}", description(&path, &model));
+            output.map_or(Ok(()), |folder| draw(&folder, &model))
         }
         ModelCommand::Validate(args) => run_validation(args),
     }
@@ -91,6 +126,10 @@ fn build(args: BuildArgs) -> Result<()> {
     let activity = args.activity.into();
     let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
     let recordings = read_recordings(&entries, activity);
+    if let Some(path) = &args.table {
+        let text = format!("{TABLE}\n{}\n", recordings.table.join("\n"));
+        write_atomic(path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
+    }
     if recordings.cycles.is_empty() {
         bail!("none of {} motions can be used for {activity}{}", entries.len(), recordings.first_reason());
     }
@@ -106,7 +145,7 @@ fn build(args: BuildArgs) -> Result<()> {
             database::MEDIAN_MULTIPLE
         );
     }
-    let model = Model::build(activity, false, &cycles)?;
+    let model = detailed(Model::build(activity, false, &cycles)?, args.components);
     write_model(&args.output, &model)?;
     println!(
         "{found} cycles from {} files, {} stretches or files left out, {} cycles kept",
@@ -115,6 +154,43 @@ fn build(args: BuildArgs) -> Result<()> {
         cycles.len()
     );
     print!("{}", description(&args.output, &model));
+    Ok(())
+}
+
+fn detailed(model: Model, components: Option<u16>) -> Model {
+    match components {
+        Some(count) => model.truncated(count.into()),
+        None => model,
+    }
+}
+
+fn update(args: UpdateArgs) -> Result<()> {
+    let model = read_model(&args.model)?;
+    let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
+    let recordings = read_recordings(&entries, model.activity);
+    recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
+    if recordings.cycles.is_empty() {
+        bail!("none of {} motions can be used for {}{}", entries.len(), model.activity, recordings.first_reason());
+    }
+    let updated = detailed(model.with(&recordings.cycles)?, args.components);
+    write_model(&args.output, &updated)?;
+    println!("{} cycles from {} files added to {} of the model", recordings.cycles.len(), recordings.files, model.members.len());
+    print!("{}", description(&args.output, &updated));
+    Ok(())
+}
+
+/// Pictures of a model.
+fn draw(folder: &Path, model: &Model) -> Result<()> {
+    let clusters = report::database_clusters(model, &format!("First weights of every cycle, {}", model.activity))?;
+    for (name, picture) in [
+        ("explained.png", report::model::explained(model)?),
+        ("clusters.png", clusters),
+        ("weights.png", report::model::coefficients(model)?),
+    ] {
+        let path = folder.join(name);
+        report::save(&path, &picture)?;
+        println!("written: {}", path.display());
+    }
     Ok(())
 }
 
@@ -167,31 +243,40 @@ fn run_validation(args: ValidateArgs) -> Result<()> {
     }
     let variance = args.variance.unwrap_or(default_variance(model.activity));
     let validation = validate(&model, variance)?;
-    let mut csv = String::from("method,metric,left_out,value\n");
-    for s in &validation.scores {
-        let _ = writeln!(csv, "{},{},{},{:.6}", s.method, s.metric, s.left_out.replace(',', ";"), s.value);
-    }
-    let path = args.output.join("validation.csv");
-    write_atomic(&path, csv.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
+    let table_of = |head: &str, scores: &[Score]| {
+        let line = |s: &Score| format!("{},{},{},{:.6}\n", s.method, s.metric, s.left_out.replace(',', ";"), s.value);
+        format!("{head}\n{}", scores.iter().map(line).collect::<String>())
+    };
     let (name, hash) = (file_name(&args.model), model_hash(&model));
     let page = ValidationReport { model: &model, name: &name, hash: &hash, variance, validation: &validation }.html();
-    let report = args.output.join("report.html");
-    write_atomic(&report, page.as_bytes()).with_context(|| format!("cannot write {}", report.display()))?;
+    for (name, text) in [
+        ("validation.csv", table_of("method,metric,left_out,value", &validation.scores)),
+        ("degrees.csv", table_of("method,angle,left_out,rms_deg", &validation.angles)),
+        ("report.html", page),
+    ] {
+        let path = args.output.join(name);
+        write_atomic(&path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    for (metric, label) in [("eq6", "distance of equation (6)"), ("rms_deg", "RMS of the joint angles (degrees)")] {
+        report::save(&args.output.join(format!("{metric}.png")), &report::model::validation(&validation.scores, metric, label)?)?;
+    }
     print!("{}", table(&validation.scores));
     println!("{} cases, in {} of them too few other subjects were recorded at both parameters", validation.cases, validation.sparse_cases);
-    println!("written: {} and report.html beside it", path.display());
+    println!("default: errors are {:.2} times their predicted standard deviations", validation.sd_ratio);
+    println!("written: {}", args.output.display());
     Ok(())
 }
 
-/// Means over all subjects.
+/// Over all subjects.
 fn table(scores: &[Score]) -> String {
-    let mut text = format!("{:<12} {:>10} {:>12} {:>10}\n", "method", "eq6", "mahalanobis", "rms_deg");
+    let mut text = format!("{:<12} {:>10} {:>12} {:>10} {:>10}\n", "method", "eq6", "mahalanobis", "rms_deg", "rms_mm");
     let all: Vec<&Score> = scores.iter().filter(|s| s.left_out == "all").collect();
     let mut methods: Vec<&str> = all.iter().map(|s| s.method).collect();
     methods.dedup();
     for method in methods {
-        let value = |metric: &str| all.iter().find(|s| s.method == method && s.metric == metric).map_or(f64::NAN, |s| s.value);
-        let _ = writeln!(text, "{method:<12} {:>10.4} {:>12.3} {:>10.2}", value("eq6"), value("mahalanobis"), value("rms_deg"));
+        let [eq6, mahalanobis, deg, mm] =
+            METRICS.map(|metric| all.iter().find(|s| s.method == method && s.metric == metric).map_or(f64::NAN, |s| s.value));
+        let _ = writeln!(text, "{method:<12} {eq6:>10.4} {mahalanobis:>12.3} {deg:>10.2} {mm:>10.1}");
     }
     text
 }

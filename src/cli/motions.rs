@@ -5,6 +5,7 @@ use anyhow::{Result, bail};
 use clap::ValueEnum;
 use muybridge::io::manifest::Entry;
 use muybridge::io::read_clip;
+use muybridge::math::order::quantile;
 use muybridge::motion_model::{Activity, Cycle, Label, segment};
 use rayon::prelude::*;
 
@@ -31,7 +32,12 @@ pub struct Recordings {
     pub cycles: Vec<Cycle>,
     pub files: usize,
     pub left_out: Vec<String>,
+    /// One line of [`TABLE`] per motion.
+    pub table: Vec<String>,
 }
+
+/// Columns of [`Recordings::table`].
+pub const TABLE: &str = "file,subject,cycles,speed_m_s_or_length_m,cycle_s,hip_height_m,left_out";
 
 impl Recordings {
     /// The end of an error message where nothing was of use.
@@ -49,6 +55,7 @@ pub fn read_recordings(entries: &[Entry], activity: Activity) -> Recordings {
     let read: Vec<_> = entries.par_iter().map(|e| cycles_of(e, activity)).collect();
     let mut recordings = Recordings::default();
     for (entry, result) in entries.iter().zip(read) {
+        recordings.table.push(table_row(entry, &result));
         match result {
             Ok((cycles, rejected)) => {
                 recordings.files += usize::from(!cycles.is_empty());
@@ -59,6 +66,18 @@ pub fn read_recordings(entries: &[Entry], activity: Activity) -> Recordings {
         }
     }
     recordings
+}
+
+/// Medians over the cycles of one motion.
+fn table_row(entry: &Entry, found: &Result<(Vec<Cycle>, Vec<String>), String>) -> String {
+    let cell = |text: &str| text.replace([',', '\n'], ";");
+    let (cycles, reasons) = match found {
+        Ok((cycles, rejected)) => (&cycles[..], rejected.join("; ")),
+        Err(reason) => (&[][..], reason.clone()),
+    };
+    let median = |of: fn(&Cycle) -> f64| quantile(cycles.iter().map(of).collect(), 0.5).map_or(String::new(), |v| format!("{v:.3}"));
+    let medians = [median(|c| c.parameter), median(|c| c.duration_s), median(|c| c.hip_height_m)].join(",");
+    format!("{},{},{},{medians},{}", cell(&entry.path.display().to_string()), cell(&entry.subject), cycles.len(), cell(&reasons))
 }
 
 fn cycles_of(entry: &Entry, activity: Activity) -> Result<(Vec<Cycle>, Vec<String>), String> {

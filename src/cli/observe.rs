@@ -1,9 +1,12 @@
 //! A session's frames to what the fit looks at: clouds and silhouettes.
 
+use std::path::Path;
+
 use anyhow::{Context, Result, bail};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::Observation;
 use muybridge::footage::FrameSet;
+use muybridge::io::frame_cloud;
 use muybridge::io::session::Session;
 use rayon::prelude::*;
 
@@ -12,11 +15,14 @@ use super::{interrupt, progress};
 /// Frames that are in memory at once.
 const BATCH: usize = 8;
 
-/// Clouds of all frames; `each` sees every frame with its pictures, in order.
+/// Clouds of all frames; `each` sees every frame with its pictures, in order. What stereo finds is kept in the folder `kept`
+/// and taken from there the next time, so that work that was stopped goes on; the folder's name must tell footage, options
+/// and program.
 pub fn observe(
     session: &Session,
     rig: &CloudRig,
     options: &CloudOptions,
+    kept: Option<&Path>,
     mut each: impl FnMut(&FrameSet, &FrameCloud) -> Result<()>,
 ) -> Result<Vec<Observation>> {
     let bar = progress::bar("clouds", session.frame_count as u64);
@@ -31,7 +37,7 @@ pub fn observe(
             .par_iter()
             .map(|frame| {
                 interrupt::check()?;
-                let cloud = rig.frame(&frame.images, options).with_context(|| format!("frame {}", frame.number));
+                let cloud = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
                 bar.inc(1);
                 cloud
             })
@@ -50,4 +56,17 @@ pub fn observe(
         );
     }
     Ok(observations)
+}
+
+/// What stereo finds in one frame, or found before.
+fn found(frame: &FrameSet, rig: &CloudRig, options: &CloudOptions, kept: Option<&Path>) -> Result<FrameCloud> {
+    let Some(path) = kept.map(|folder| folder.join(format!("{:06}.frame", frame.number))) else {
+        return Ok(rig.frame(&frame.images, options)?);
+    };
+    if let Some(before) = frame_cloud::read(&path) {
+        return Ok(before);
+    }
+    let found = rig.frame(&frame.images, options)?;
+    frame_cloud::write(&path, &found).with_context(|| format!("cannot write {}", path.display()))?;
+    Ok(found)
 }

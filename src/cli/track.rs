@@ -7,9 +7,12 @@ use clap::Args;
 use image::GrayImage;
 use muybridge::body::{Clip, NODES, Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
-use muybridge::fit::{self, Fit, FitOptions, Observation};
+use muybridge::fit::{self, Checkpoints, Fit, FitOptions, Observation};
 use muybridge::footage::FrameSet;
-use muybridge::io::{bvh, fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::io::outputs_json::Source;
+use muybridge::io::session_config::{self, DEFAULT_ACTIVITY, SessionConfig};
+use muybridge::io::{content, fit_checkpoint, fit_json, joints_csv, model_npz, session::Session, style_json};
+use muybridge::math::euler::Order;
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{self, DepthMap};
 use muybridge::report::{self, track::UNDECIDED, walk::BAND};
@@ -17,25 +20,29 @@ use muybridge::rig::{Rig, Up};
 use muybridge::style::Style;
 use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
 
-use super::motions::ActivityName;
+use super::motions::{ActivityName, file_name};
+use super::outputs::{Names, Writer};
 use super::{interrupt, observe, track_report};
 
 /// Frames in the strip of overlays.
 const STRIP: usize = 6;
 
-#[derive(Args)]
+#[derive(Args, Default)]
 pub struct TrackArgs {
     /// Session folder with Calib.toml and one folder or video per camera
     session: PathBuf,
     /// Motion model (.npz) of `muybridge model build`; the embedded synthetic one without it
     #[arg(long)]
     model: Option<PathBuf>,
-    /// Which embedded model to use
-    #[arg(long, default_value = "walking", conflicts_with = "model")]
-    activity: ActivityName,
-    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, fit.json
+    /// Which embedded model to use; walking without it
+    #[arg(long, conflicts_with = "model")]
+    activity: Option<ActivityName>,
+    /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, motion.glb, joints.trc, joints.c3d, angles.mot, outputs.json, fit.json
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
+    /// Folder that keeps what is found frame by frame, so that a run that was stopped goes on from there
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
     /// Frames per second of pictures
     #[arg(long)]
     fps: Option<f64>,
@@ -80,10 +87,30 @@ pub struct Tracked {
     pub depth: Option<(usize, DepthMap)>,
 }
 
+impl TrackArgs {
+    /// A session with the options of its `muybridge.toml`.
+    pub fn of(session: &Path, output: PathBuf, work: PathBuf) -> TrackArgs {
+        TrackArgs { session: session.into(), output, work: Some(work), ..TrackArgs::default() }
+    }
+
+    /// What the command line says, and where it says nothing what `muybridge.toml` says.
+    fn config(&self) -> Result<SessionConfig> {
+        let given = SessionConfig {
+            fps: self.fps,
+            model: self.model.clone(),
+            activity: self.activity.map(Into::into),
+            variance: self.variance,
+            pictures: self.pictures.then_some(true),
+        };
+        Ok(given.or(session_config::read(&self.session)?))
+    }
+}
+
 pub fn run(args: &TrackArgs) -> Result<()> {
-    let model = match &args.model {
-        Some(path) => NamedModel::new(model_npz::read_model(path)?, path.display().to_string()),
-        None => NamedModel::synthetic(args.activity.into())?,
+    let config = args.config()?;
+    let model = match &config.model {
+        Some(path) => NamedModel::new(model_npz::read_model(path)?, file_name(path)),
+        None => NamedModel::synthetic(config.activity.unwrap_or(DEFAULT_ACTIVITY))?,
     };
     if model.model.synthetic {
         eprintln!(
@@ -93,24 +120,21 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     let (session, notices) = Session::open(&args.session, args.fps)?;
     notices.iter().for_each(|notice| eprintln!("note: {notice}"));
     let mut options = FitOptions::default();
-    if let Some(variance) = args.variance {
+    if let Some(variance) = config.variance {
         options.components = model.model.components(variance);
     }
-    let tracked = track(&session, &model, &options)?;
+    let seen = look(&session, args.work.as_deref(), |_, _, _| Ok(()))?;
+    let kept = args.work.as_ref().map(|work| kept_folder(work, "fit", &session, &format!("{} {options:?} {}", model.hash, session.fps)));
+    let tracked = fit_to(&session, seen, &model, &options, kept.transpose()?.as_deref())?;
     write(&args.output, &session, &model, &tracked)?;
     if !args.no_report {
         track_report::write(&args.output, &session, &model, &tracked)?;
     }
-    if args.pictures {
+    if config.pictures == Some(true) {
         draw(&args.output.join("pictures"), &session.rig, &model, &tracked)?;
     }
     summary(&args.output, &tracked.fit);
     Ok(())
-}
-
-/// Clouds of a session and the fit to them.
-pub fn track(session: &Session, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
-    fit_to(session, look(session, |_, _, _| Ok(()))?, model, options)
 }
 
 /// What the cameras saw in all frames.
@@ -121,15 +145,16 @@ pub struct Seen {
     floor_m: Option<f64>,
 }
 
-/// Clouds of a session; `each` sees every frame, in order.
-pub fn look(session: &Session, mut each: impl FnMut(&CloudRig, &FrameSet, &FrameCloud) -> Result<()>) -> Result<Seen> {
+/// Clouds of a session; `each` sees every frame, in order. In the folder `work` they are kept until the next run.
+pub fn look(session: &Session, work: Option<&Path>, mut each: impl FnMut(&CloudRig, &FrameSet, &FrameCloud) -> Result<()>) -> Result<Seen> {
     let cloud_options = CloudOptions::default();
+    let kept = work.map(|work| kept_folder(work, "clouds", session, &format!("{cloud_options:?}"))).transpose()?;
     let stage = session.stages()?;
     let rig =
         CloudRig::new(&session.rig, Some(&stage), &cloud_options).with_context(|| format!("the rig of {}", session.folder.display()))?;
     let step = session.frame_count.div_ceil(STRIP).max(1);
     let (mut pictures, mut depth, mut index) = (Vec::new(), None, 0);
-    let observations = observe::observe(session, &rig, &cloud_options, |frame, found| {
+    let observations = observe::observe(session, &rig, &cloud_options, kept.as_deref(), |frame, found| {
         if index % step == 0 {
             pictures.push((index, frame.images.clone()));
         }
@@ -150,12 +175,25 @@ fn depth_of(rig: &CloudRig, found: &FrameCloud) -> Option<DepthMap> {
     Some(map)
 }
 
-/// The fit to what was seen of a session.
-pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions) -> Result<Tracked> {
+/// The folder below `work` for what this program finds in this footage with these options.
+fn kept_folder(work: &Path, kind: &str, session: &Session, options: &str) -> Result<PathBuf> {
+    let parts = [&content::inputs_hash(&session.folder), &content::program(&super::executable()), options];
+    Ok(work.join(format!("{kind}-{}", &blake3::hash(parts.join("\n").as_bytes()).to_hex()[..16])))
+}
+
+/// The fit to what was seen of a session; in the folder `kept` its state is kept after every iteration.
+pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions, kept: Option<&Path>) -> Result<Tracked> {
     let Seen { observations, pictures, depth, floor_m } = seen;
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
-    let fit = fit::fit(&observations, &session.rig, &model.model, floor_m, options, &|share| {
+    let checkpoints = Checkpoints {
+        load: &|stage| fit_checkpoint::read(kept?, stage),
+        save: &|stage, at| {
+            // A disk that is full stops the outputs, which say so.
+            let _ = kept.map(|folder| fit_checkpoint::write(folder, stage, at));
+        },
+    };
+    let fit = fit::resume(&observations, &session.rig, &model.model, floor_m, options, &checkpoints, &|share| {
         let percent = (100.0 * share) as u64;
         bar.inc(percent.saturating_sub(done.replace(percent)));
         !interrupt::came()
@@ -175,7 +213,10 @@ pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tra
     let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
     joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
     let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
-    bvh::write_clip(&folder.join("motion.bvh"), &clip, Some(&clip_from_rig))?;
+    let source = Source { motion: file_name(&session.folder), model: model.name.clone(), model_hash: model.hash.clone() };
+    let mut files = Writer::new(folder, fit.shape(), Some(clip_from_rig), Order::ZXY, source);
+    files.motion(&Names::tracked(), &model.model.activity.to_string(), &clip)?;
+    files.finish()?;
     style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
     let report = folder.join("fit.json");
     fit_json::write(&report, fit, observations, &model.name, &model.hash).with_context(|| report.display().to_string())

@@ -9,13 +9,12 @@
 //! worse: a weighted median over pixels of like grey, which a shirt's folds mislead. Checked against a drawn step with a
 //! textured near side.
 
-use super::subpixel::{around, sample};
+use super::subpixel::{Other, around, extremes};
 use crate::rig::rectify::Plane;
-use nalgebra::Vector2;
 use rayon::prelude::*;
 
 /// Width of the strips that are looked for, px: the reach of the correlation windows.
-const REACH_PX: isize = 6;
+const REACH_PX: usize = 6;
 /// Smaller steps are slants, px.
 const JUMP_PX: f32 = 1.0;
 /// T and π of (1), grey levels.
@@ -24,14 +23,16 @@ const OCCLUSION: f32 = 5.0;
 /// Part of c(d) below which c(d') must lie; nearer 1 noise decides.
 const CLEARLY: f32 = 0.7;
 
-/// The disparities with those of far sides in place of near ones where (1) says so, NaN where it is in doubt. `others` are the other views' pictures,
-/// at the reference's exposure, with their steps.
-pub fn behind(reference: &Plane, others: &[(&Plane, Vector2<f64>)], disparity: &Plane) -> Plane {
+/// The disparities with those of far sides in place of near ones where (1) says so, NaN where it is in doubt. `reference` is a part of the reference view;
+/// `others` have its exposure.
+pub fn behind(reference: &Plane, others: &[Other], disparity: &Plane) -> Plane {
     let width = disparity.width() as usize;
     let values = disparity.as_raw();
+    let farthest = extremes(values, width, REACH_PX, f32::min);
     let one = |i: usize| {
         let near = values[i];
-        let Some(far) = far_side(values, width, i) else { return near };
+        let beside = farthest[i] < near - JUMP_PX;
+        let Some(far) = beside.then(|| far_side(values, width, i)).flatten() else { return near };
         let [there, here] = [far, near].map(|d| cost(reference, others, i, d));
         match there < CLEARLY * here {
             true => far,
@@ -46,17 +47,16 @@ pub fn behind(reference: &Plane, others: &[(&Plane, Vector2<f64>)], disparity: &
 /// Disparity of the nearest pixel on a farther surface.
 fn far_side(disparity: &[f32], width: usize, i: usize) -> Option<f32> {
     let below = disparity[i] - JUMP_PX;
-    let farther = around(i, REACH_PX, width, disparity.len()).filter(|(_, _, j)| disparity[*j] < below);
+    let farther = around(i, REACH_PX as isize, width, disparity.len()).filter(|(_, _, j)| disparity[*j] < below);
     farther.min_by_key(|(dx, dy, _)| dx * dx + dy * dy).map(|(_, _, j)| disparity[j])
 }
 
 /// c of (1).
-fn cost(reference: &Plane, others: &[(&Plane, Vector2<f64>)], i: usize, d: f32) -> f32 {
+fn cost(reference: &Plane, others: &[Other], i: usize, d: f32) -> f32 {
     let (width, grey) = (reference.width() as usize, reference.as_raw());
-    let pair = |(other, step): &(&Plane, Vector2<f64>)| -> f32 {
-        let shift = step.map(|s| s as f32) * d;
+    let pair = |other: &Other| -> f32 {
         let difference = |j: usize| {
-            let e = (sample(other, (j % width) as f32 + shift.x, (j / width) as f32 + shift.y) - grey[j]).abs();
+            let e = (other.see((j % width) as f32, (j / width) as f32, d) - grey[j]).abs();
             if e < TRUNCATION { e } else { TRUNCATION }
         };
         around(i, 1, width, grey.len()).map(|(_, _, j)| difference(j)).sum()
@@ -70,6 +70,7 @@ fn cost(reference: &Plane, others: &[(&Plane, Vector2<f64>)], i: usize, d: f32) 
 mod tests {
     use super::*;
     use image::Luma;
+    use nalgebra::Vector2;
 
     /// A near square of disparity 12 before a far plane of 6, as the reference, a right and an upper camera see them.
     fn views() -> [(Plane, Vector2<f64>); 3] {
@@ -89,7 +90,7 @@ mod tests {
     #[test]
     fn a_fattened_step_goes_back_to_its_edge() {
         let views = views();
-        let others = [(&views[1].0, views[1].1), (&views[2].0, views[2].1)];
+        let others = [1, 2].map(|k| Other::new(&views[k].0, views[k].1, [0, 0]));
         let square = |grow: u32| {
             Plane::from_fn(100, 80, |x, y| {
                 let inside = (40 - grow..60 + grow).contains(&x) && (30 - grow..50 + grow).contains(&y);

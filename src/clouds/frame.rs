@@ -4,11 +4,11 @@ use super::cloud::Cloud;
 use super::correlate::Region;
 use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
 use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
-use super::subpixel::{self, Refined};
+use super::subpixel::{self, Other, Refined};
 use super::{edges, tidy, triangulate};
 use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
-use image::{GrayImage, ImageBuffer, Luma};
+use image::{GrayImage, Luma};
 use nalgebra::Vector3;
 
 /// Room around what changed, px: the reach of the correlation windows and of the outline's blur.
@@ -182,11 +182,11 @@ fn everything(
 ) -> Result<FrameCloud, CloudError> {
     let regions = vec![whole(rectification); planes.len()];
     let found = search(rectification, planes, &regions, range, options);
-    let Refined { disparity, sigma_px } = refine(&found, found[0].1.disparity.clone());
-    let refined = Refined { disparity: disparity.clone(), sigma_px };
-    let cloud = points(rectification, &found[0].0, &refined, options);
+    let refined = refine(&found, regions[0], None);
+    let cloud = points(rectification, &found[0].0, &refined, regions[0], options);
     let [width, height] = rectification.size_px;
     let changed = GrayImage::from_pixel(width, height, Luma([255]));
+    let disparity = refined.disparity;
     Ok(FrameCloud { cloud, masks: vec![None; cameras], matched: disparity.clone(), disparity, changed })
 }
 
@@ -198,20 +198,28 @@ fn person(
     range: [usize; 2],
     options: &CloudOptions,
 ) -> FrameCloud {
-    let changes: Vec<Change> = planes.iter().zip(&stage.views).map(|(now, stage)| compare(now, &stage.plane, &options.stage)).collect();
+    let mut changes: Vec<Change> = planes.iter().zip(&stage.views).map(|(now, stage)| compare(now, stage, &options.stage)).collect();
     let regions: Option<Vec<Region>> = changes.iter().map(|c| changed_box(&c.changed, &options.stage, MARGIN_PX)).collect();
     let Some(regions) = regions else { return nobody(rectification, cameras) };
     let found = search(rectification, planes, &regions, range, options);
-    let outline = |k: usize| person_mask(rectification, k, &changes, &stage.views[k], &found[k].1, &options.stage);
+    let outline = |k: usize| person_mask(rectification, k, regions[k], &changes, &stage.views[k], &found[k].1, &options.stage);
     let persons: Vec<GrayImage> = (0..found.len()).map(outline).collect();
-    let refined = refine(&found, inside(&found[0].1.disparity, &persons[0]));
+    let refined = refine(&found, regions[0], Some(&persons[0]));
     let mut masks = vec![None; cameras];
     for (k, view) in rectification.views.iter().enumerate() {
-        masks[view.index] = Some(rectification.unwarp(k, &persons[k]));
+        masks[view.index] = Some(rectification.unwarp(k, &persons[k], regions[k].corner()));
     }
-    let cloud = points(rectification, &found[0].0, &refined, options);
-    let matched = either(&refined.disparity, &outside(&found[0].1.disparity, &persons[0]));
-    FrameCloud { cloud, masks, disparity: refined.disparity, matched, changed: changes[0].changed.clone() }
+    let cloud = points(rectification, &found[0].0, &refined, regions[0], options);
+    let [width, height] = rectification.size_px;
+    let mut disparity = Plane::from_pixel(width, height, Luma([f32::NAN]));
+    let mut matched = found[0].1.disparity.clone();
+    let (all, known): (&mut [f32], &mut [f32]) = (&mut matched, &mut disparity);
+    for (k, i) in regions[0].rows(width as usize).flatten().enumerate().filter(|(k, _)| persons[0].as_raw()[*k] != 0) {
+        known[i] = refined.disparity.as_raw()[k];
+        all[i] = known[i];
+    }
+    let changed = changes.swap_remove(0).changed;
+    FrameCloud { cloud, masks, disparity, matched, changed }
 }
 
 fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Vec<&'a GrayImage>, CloudError> {
@@ -230,9 +238,9 @@ fn pick<'a>(rectification: &Rectification, images: &'a [GrayImage]) -> Result<Ve
 
 /// Standard deviation of the grey values.
 fn contrast(image: &GrayImage) -> f64 {
+    let (sum, squares) = image.iter().fold((0u64, 0u64), |(sum, squares), &v| (sum + u64::from(v), squares + u64::from(v) * u64::from(v)));
     let n = image.len().max(1) as f64;
-    let mean = image.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
-    (image.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n).sqrt()
+    (squares as f64 / n - (sum as f64 / n).powi(2)).max(0.0).sqrt()
 }
 
 /// Whole disparities between the farthest and the nearest depth.
@@ -258,22 +266,6 @@ fn search(
     prepared.into_iter().zip(found).collect()
 }
 
-fn inside(disparity: &Plane, mask: &GrayImage) -> Plane {
-    let values = disparity.iter().zip(mask.iter()).map(|(&d, &m)| if m == 0 { f32::NAN } else { d }).collect();
-    ImageBuffer::from_raw(disparity.width(), disparity.height(), values).expect("same size")
-}
-
-fn outside(disparity: &Plane, mask: &GrayImage) -> Plane {
-    let values = disparity.iter().zip(mask.iter()).map(|(&d, &m)| if m == 0 { d } else { f32::NAN }).collect();
-    ImageBuffer::from_raw(disparity.width(), disparity.height(), values).expect("same size")
-}
-
-/// The first plane's values, the second's where it has none.
-fn either(first: &Plane, second: &Plane) -> Plane {
-    let values = first.iter().zip(second.iter()).map(|(a, b)| if a.is_nan() { *b } else { *a }).collect();
-    ImageBuffer::from_raw(first.width(), first.height(), values).expect("same size")
-}
-
 fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
     let mut masks = vec![None; cameras];
     for view in &rectification.views {
@@ -285,12 +277,24 @@ fn nobody(rectification: &Rectification, cameras: usize) -> FrameCloud {
     FrameCloud { cloud: Cloud::default(), masks, disparity: nothing.clone(), matched: nothing, changed: GrayImage::new(width, height) }
 }
 
-/// The reference view's disparities refined on the grey values of all views.
-fn refine(found: &[(StereoView, ViewDisparity)], disparity: Plane) -> Refined {
+/// The reference view's disparities in a region, inside the mask, refined on the grey values of all views.
+fn refine(found: &[(StereoView, ViewDisparity)], region: Region, mask: Option<&GrayImage>) -> Refined {
     let (reference, matched) = &found[0];
-    let others: Vec<_> = found[1..].iter().map(|(view, _)| (&view.plane, view.step - reference.step)).collect();
-    let disparity = edges::behind(&reference.plane, &others, &confirmed_by_all(found, disparity));
-    subpixel::refine(&reference.plane, &others, &disparity, &matched.confirmed)
+    let width = reference.plane.width() as usize;
+    let part = |plane: &Plane| {
+        let values = region.cut(plane, width);
+        Plane::from_raw(region.width() as u32, region.height() as u32, values).expect("one value per pixel")
+    };
+    let (mut disparity, grey) = (part(&matched.disparity), part(&reference.plane));
+    for (d, m) in disparity.iter_mut().zip(mask.into_iter().flat_map(|mask| mask.iter())) {
+        *d = if *m == 0 { f32::NAN } else { *d };
+    }
+    let confirmed = region.cut(&matched.confirmed, width);
+    confirmed_by_all(found, region, &mut disparity, &confirmed);
+    let others: Vec<Other> =
+        found[1..].iter().map(|(view, _)| Other::new(&view.plane, view.step - reference.step, region.corner())).collect();
+    let disparity = edges::behind(&grey, &others, &disparity);
+    subpixel::refine(&grey, &others, &disparity, &confirmed)
 }
 
 /// Disparities of two views' own matches that differ by more are of different surfaces, px.
@@ -301,12 +305,13 @@ const AGREEMENT_PX: f32 = 1.0;
 ///
 /// Three views can afford more: each of the others must have matched that place itself, and alike. This costs a twentieth of the
 /// body and removes 11 to 45 % of the errors above 1 px; two views, which see less, would lose as much again.
-fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], mut disparity: Plane) -> Plane {
-    let (reference, matched) = &found[0];
+fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], region: Region, disparity: &mut Plane, confirmed: &[u8]) {
+    let [left, top] = region.corner().map(|c| c as f64);
     for (k, (view, own)) in found[1..].iter().enumerate() {
-        let step = view.step - reference.step;
+        let step = view.step - found[0].0.step;
         let stands = |u: u32, v: u32, d: f32, confirmed: u8| {
-            let (x, y) = ((f64::from(u) + step.x * f64::from(d)).round(), (f64::from(v) + step.y * f64::from(d)).round());
+            let at = [left + f64::from(u) + step.x * f64::from(d), top + f64::from(v) + step.y * f64::from(d)];
+            let [x, y] = at.map(f64::round);
             let inside = x >= 0.0 && y >= 0.0 && x < f64::from(view.plane.width()) && y < f64::from(view.plane.height());
             if !inside || view.plane.get_pixel(x as u32, y as u32).0[0].is_nan() {
                 return true;
@@ -314,17 +319,16 @@ fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], mut disparity: Plane)
             let alike = (own.disparity.get_pixel(x as u32, y as u32).0[0] - d).abs() <= AGREEMENT_PX;
             confirmed >> k & 1 != 0 && (alike || found.len() == 2)
         };
-        for ((u, v, d), confirmed) in disparity.enumerate_pixels_mut().zip(&matched.confirmed) {
+        for ((u, v, d), confirmed) in disparity.enumerate_pixels_mut().zip(confirmed) {
             if !d.0[0].is_nan() && !stands(u, v, d.0[0], *confirmed) {
                 d.0[0] = f32::NAN;
             }
         }
     }
-    disparity
 }
 
-fn points(rectification: &Rectification, reference: &StereoView, refined: &Refined, options: &CloudOptions) -> Cloud {
-    let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, refined, &reference.plane));
+fn points(rectification: &Rectification, reference: &StereoView, refined: &Refined, region: Region, options: &CloudOptions) -> Cloud {
+    let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, refined, region.corner(), &reference.plane));
     match options.voxel_m {
         Some(side) => tidy::thin(cloud, side),
         None => cloud,

@@ -67,28 +67,59 @@ fn gradient_row_plain(rows: [&[f32]; 3], [right, down]: [f32; 2], out: &mut [u8]
 
 /// Gaussian blur with replicated borders.
 pub(crate) fn blur(values: &[f32], width: usize, sigma_px: f32) -> Vec<f32> {
-    if values.is_empty() {
-        return Vec::new();
-    }
     let kernel = gaussian(sigma_px);
-    let (radius, height) = (kernel.len() / 2, values.len() / width);
-    let mut across = vec![0.0; values.len()];
-    across.par_chunks_exact_mut(width).zip(values.par_chunks_exact(width)).for_each(|(out, row)| {
-        let mut padded = vec![row[0]; radius];
-        padded.extend_from_slice(row);
-        padded.extend(std::iter::repeat_n(row[width - 1], radius));
-        for (k, weight) in kernel.iter().enumerate() {
-            out.iter_mut().zip(&padded[k..]).for_each(|(o, v)| *o += weight * v);
-        }
+    let (radius, height) = (kernel.len() / 2, values.len() / width.max(1));
+    let mut blurred = vec![0.0; values.len()];
+    let scratch = || (Vec::with_capacity(kernel.len()), vec![0.0; width + 2 * radius]);
+    blurred.par_chunks_exact_mut(width.max(1)).enumerate().for_each_init(scratch, |(lines, padded), (y, out)| {
+        lines.clear();
+        lines.extend((y..y + kernel.len()).map(|y| &values[y.saturating_sub(radius).min(height - 1) * width..][..width]));
+        weighted_sum(lines, &kernel, &mut padded[radius..][..width]);
+        let [first, last] = [padded[radius], padded[radius + width - 1]];
+        padded[..radius].fill(first);
+        padded[radius + width..].fill(last);
+        let shifted: Vec<&[f32]> = (0..kernel.len()).map(|k| &padded[k..][..width]).collect();
+        weighted_sum(&shifted, &kernel, out);
     });
-    let mut both = vec![0.0; values.len()];
-    both.par_chunks_exact_mut(width).enumerate().for_each(|(y, out)| {
-        for (k, weight) in kernel.iter().enumerate() {
-            let from = (y + k).saturating_sub(radius).min(height - 1);
-            out.iter_mut().zip(&across[from * width..]).for_each(|(o, v)| *o += weight * v);
+    blurred
+}
+
+fn weighted_sum(lines: &[&[f32]], weights: &[f32], out: &mut [f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { weighted_sum_avx2(lines, weights, out) };
+    }
+    weighted_sum_plain(lines, weights, out);
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn weighted_sum_avx2(lines: &[&[f32]], weights: &[f32], out: &mut [f32]) {
+    weighted_sum_plain(lines, weights, out);
+}
+
+/// Values that are summed together, in registers.
+const BLOCK: usize = 32;
+
+#[inline(always)]
+fn weighted_sum_plain(lines: &[&[f32]], weights: &[f32], out: &mut [f32]) {
+    let (blocks, rest) = out.as_chunks_mut::<BLOCK>();
+    for (k, out) in blocks.iter_mut().enumerate() {
+        let mut sums = [0.0; BLOCK];
+        for (line, weight) in lines.iter().zip(weights) {
+            if let Some(values) = line[k * BLOCK..].first_chunk::<BLOCK>() {
+                for (sum, value) in sums.iter_mut().zip(values) {
+                    *sum += weight * value;
+                }
+            }
         }
-    });
-    both
+        *out = sums;
+    }
+    let done = blocks.len() * BLOCK;
+    for (x, out) in (done..).zip(rest) {
+        *out = lines.iter().zip(weights).map(|(line, weight)| weight * line[x]).sum();
+    }
 }
 
 fn gaussian(sigma_px: f32) -> Vec<f32> {

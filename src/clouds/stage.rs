@@ -12,7 +12,7 @@ use super::prefilter::blur;
 use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
 use crate::footage::regions;
 use crate::rig::rectify::{Plane, Rectification};
-use image::{GrayImage, Luma};
+use image::GrayImage;
 
 /// When a pixel counts as changed, and as standing before the stage.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -62,6 +62,8 @@ pub(crate) struct StageView {
     pub matched: Plane,
     /// The same with its gaps filled.
     pub disparity: Plane,
+    /// Logarithm of the picture, see [`DARK`]; NaN where unknown.
+    pub logarithm: Vec<f32>,
 }
 
 impl Stage {
@@ -72,6 +74,7 @@ impl Stage {
         let regions = vec![whole(rectification); prepared.len()];
         let found = match_views(&prepared, &regions, [0, largest_px], options);
         let views = prepared.into_iter().zip(found).map(|(p, f)| StageView {
+            logarithm: p.plane.iter().map(|&v| logarithm(v)).collect(),
             plane: p.plane,
             disparity: fill_gaps(&f.disparity),
             matched: f.disparity,
@@ -126,47 +129,61 @@ pub(crate) struct Change {
     pub ratio: Vec<f32>,
     /// 255 where the difference exceeds its noise.
     pub changed: GrayImage,
-    /// 255 where the grey values are a smooth fraction of the stage's, as in a cast shadow.
-    pub shaded: GrayImage,
+    /// The ratio smoothed over the size of a shadow's edge.
+    coarse: Vec<f32>,
+    /// How far the ratio is from that.
+    roughness: Vec<f32>,
+    /// Roughness of a shadow at most.
+    smooth: f32,
+    /// Step of a shadow's ratio between neighbours at most.
+    step: f32,
 }
 
 /// Compares a picture with the stage's. Most pixels must show the stage: the medians over the picture are taken for noise.
-pub(crate) fn compare(now: &Plane, stage: &Plane, options: &StageOptions) -> Change {
+pub(crate) fn compare(now: &Plane, stage: &StageView, options: &StageOptions) -> Change {
     let width = now.width() as usize;
-    let both = |f: fn(f32, f32) -> f32| -> Vec<f32> {
-        now.iter().zip(stage.iter()).map(|(&a, &b)| if a.is_nan() || b.is_nan() { f32::NAN } else { f(a, b) }).collect()
-    };
-    let difference = both(|a, b| a - b);
-    let known: Vec<bool> = difference.iter().map(|d| !d.is_nan()).collect();
-    let zero = |values: Vec<f32>| -> Vec<f32> { values.into_iter().map(|v| if v.is_nan() { 0.0 } else { v }).collect() };
-    let difference = blur(&zero(difference), width, DIFFERENCE_SIGMA_PX);
+    let known = |i: usize| !(now.as_raw()[i] - stage.plane.as_raw()[i]).is_nan();
+    let or_0 = |v: f32| if v.is_nan() { 0.0 } else { v };
+    let difference: Vec<f32> = now.iter().zip(stage.plane.iter()).map(|(a, b)| or_0(a - b)).collect();
+    let difference = blur(&difference, width, DIFFERENCE_SIGMA_PX);
     // 8-bit pictures have at least rounding noise.
-    let noise = (1.4826 * median(difference.iter().map(|d| d.abs()), &known)).max(0.5);
-    let ratio = blur(&zero(both(|a, b| ((a.max(0.0) + DARK) / (b.max(0.0) + DARK)).ln())), width, DIFFERENCE_SIGMA_PX);
+    let noise = (1.4826 * median_over(difference.len(), known, |i| difference[i].abs())).max(0.5);
+    let ratio: Vec<f32> = now.iter().zip(&stage.logarithm).map(|(&a, b)| or_0(logarithm(a) - b)).collect();
+    let ratio = blur(&ratio, width, DIFFERENCE_SIGMA_PX);
     let coarse = blur(&ratio, width, 2.0);
     let squares: Vec<f32> = ratio.iter().zip(&coarse).map(|(r, c)| (r - c).powi(2)).collect();
-    let roughness: Vec<f32> = blur(&squares, width, 1.5).into_iter().map(f32::sqrt).collect();
-    let smooth = options.shade_roughness * median(roughness.iter().copied(), &known);
-    let step = 4.0 * 1.4826 * median(ratio.iter().zip(ratio.iter().skip(1)).map(|(a, b)| (a - b).abs()), &known);
-    let mask = |set: &dyn Fn(usize) -> bool| {
-        GrayImage::from_fn(now.width(), now.height(), |x, y| Luma([if set(y as usize * width + x as usize) { 255 } else { 0 }]))
-    };
-    let changed = mask(&|i| difference[i].abs() > options.change_sigmas * noise);
-    let mut shaded = mask(&|i| roughness[i] < smooth && coarse[i] < 0.0 && coarse[i] > DARKEST_SHADE);
-    grow_shade(&mut shaded, &ratio, step);
-    Change { difference, ratio, changed, shaded }
+    let mut roughness = blur(&squares, width, 1.5);
+    roughness.iter_mut().for_each(|r| *r = r.sqrt());
+    let smooth = options.shade_roughness * median_over(roughness.len(), known, |i| roughness[i]);
+    let steps = ratio.len().saturating_sub(1);
+    let step = 4.0 * 1.4826 * median_over(steps, known, |i| (ratio[i] - ratio[i + 1]).abs());
+    let changed = difference.iter().map(|d| if d.abs() > options.change_sigmas * noise { 255 } else { 0 }).collect();
+    let changed = GrayImage::from_raw(now.width(), now.height(), changed).expect("one value per pixel");
+    Change { difference, ratio, changed, coarse, roughness, smooth, step }
+}
+
+impl Change {
+    /// Where in a region the grey values are a smooth fraction of the stage's, as in a cast shadow.
+    fn shaded(&self, region: Region) -> Vec<bool> {
+        let width = self.changed.width() as usize;
+        let shade = |i: usize| self.roughness[i] < self.smooth && self.coarse[i] < 0.0 && self.coarse[i] > DARKEST_SHADE;
+        let mut shaded: Vec<bool> = region.rows(width).flatten().map(shade).collect();
+        grow_shade(&mut shaded, &region.cut(&self.ratio, width), region.width(), self.step);
+        shaded
+    }
 }
 
 /// Roughness reaches a few pixels beyond an outline; there the shadow grows over small steps of the ratio.
-fn grow_shade(shaded: &mut GrayImage, ratio: &[f32], largest_step: f32) {
-    let (width, height) = (shaded.width() as usize, shaded.height() as usize);
+fn grow_shade(shaded: &mut [bool], ratio: &[f32], width: usize, largest_step: f32) {
+    let mut before = shaded.to_vec();
     for _ in 0..GROWTH_PX {
-        let before = shaded.as_raw().clone();
-        for i in width..(width * height).saturating_sub(width + 1) {
-            let joins = |j: usize| before[j] != 0 && (ratio[i] - ratio[j]).abs() < largest_step;
-            if before[i] == 0 && ratio[i] < 0.0 && (joins(i - 1) || joins(i + 1) || joins(i - width) || joins(i + width)) {
-                shaded.put_pixel((i % width) as u32, (i / width) as u32, Luma([255]));
+        before.copy_from_slice(shaded);
+        for i in width..shaded.len().saturating_sub(width + 1) {
+            if before[i] || ratio[i] >= 0.0 {
+                continue;
             }
+            let joins = |j: usize| before[j] && (ratio[i] - ratio[j]).abs() < largest_step;
+            shaded[i] = joins(i - 1) || joins(i + 1) || joins(i - width) || joins(i + width);
         }
     }
 }
@@ -183,8 +200,28 @@ const DARK: f32 = 5.0;
 /// Logarithm of the deepest shadow: a fifth of the light. What is darker is a dark thing.
 const DARKEST_SHADE: f32 = -1.6;
 
-fn median(values: impl Iterator<Item = f32>, known: &[bool]) -> f32 {
-    let mut values: Vec<f32> = values.zip(known).filter(|(_, k)| **k).map(|(v, _)| v).collect();
+/// Logarithm of a grey value, see [`DARK`]; NaN for NaN.
+#[inline]
+fn logarithm(grey: f32) -> f32 {
+    if grey.is_nan() { f32::NAN } else { ln(grey.max(0.0) + DARK) }
+}
+
+/// Natural logarithm of a normal number above 0, to 2e-6. x = 2^e m with 1 <= m < 2 and t = (m − 1) / (m + 1) give
+/// e ln 2 + 2 (t + t³/3 + t⁵/5 + …), which, unlike the library's, is done for many pixels together.
+#[inline]
+fn ln(x: f32) -> f32 {
+    let (exponent, m) = ((x.to_bits() >> 23) as i32 - 127, f32::from_bits(x.to_bits() & 0x007f_ffff | 0x3f80_0000));
+    let t = (m - 1.0) / (m + 1.0);
+    let s = t * t;
+    exponent as f32 * std::f32::consts::LN_2 + 2.0 * t * (1.0 + s * (1.0 / 3.0 + s * (0.2 + s * (1.0 / 7.0 + s * (1.0 / 9.0)))))
+}
+
+/// One pixel in this many is enough for a median over a picture; prime, so that they do not stand in columns.
+const SAMPLED: usize = 11;
+
+/// Median of `value` over the known of the pixels 0..count; 0 without any.
+fn median_over(count: usize, known: impl Fn(usize) -> bool, value: impl Fn(usize) -> f32) -> f32 {
+    let mut values: Vec<f32> = (0..count).step_by(SAMPLED).filter(|&i| known(i)).map(value).collect();
     let middle = values.len() / 2;
     if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(middle, f32::total_cmp).1 }
 }
@@ -193,15 +230,10 @@ fn median(values: impl Iterator<Item = f32>, known: &[bool]) -> f32 {
 pub(crate) fn changed_box(changed: &GrayImage, options: &StageOptions, margin: usize) -> Option<Region> {
     let (width, height) = (changed.width() as usize, changed.height() as usize);
     let solid = regions::box_vote(changed, 1, 0.6);
-    let mut found: Option<Region> = None;
-    for piece in regions::pieces(&solid, false).into_iter().filter(|p| p.len() >= options.smallest_piece_px) {
-        for i in piece {
-            let (x, y) = (i % width, i / width);
-            let b = found.get_or_insert(Region { x: [x, x], y: [y, y] });
-            *b = Region { x: [b.x[0].min(x), b.x[1].max(x)], y: [b.y[0].min(y), b.y[1].max(y)] };
-        }
-    }
-    let grow = |[low, high]: [usize; 2], size: usize| [low.saturating_sub(margin), (high + 1 + margin).min(size)];
+    let pieces = regions::runs(&solid, false);
+    let large = pieces.iter().filter(|piece| regions::runs_area_px(piece) >= options.smallest_piece_px);
+    let found = large.flatten().map(|run| Region { x: [run.from, run.to], y: [run.y, run.y + 1] }).reduce(Region::around);
+    let grow = |[low, high]: [usize; 2], size: usize| [low.saturating_sub(margin), (high + margin).min(size)];
     found.map(|b| Region { x: grow(b.x, width), y: grow(b.y, height) })
 }
 
@@ -211,45 +243,55 @@ fn clearance(rectification: &Rectification, stage_px: f32, distance_m: f64) -> f
     if depth > distance_m { (rectification.disparity(depth - distance_m) - f64::from(stage_px)) as f32 } else { f32::INFINITY }
 }
 
-/// The person in rectified view `k`: 0/255. `changes` and `found` are those of all views.
+/// The person in `region` of rectified view `k`: 0/255. `changes` are those of all views.
 pub(crate) fn person_mask(
     rectification: &Rectification,
     k: usize,
+    region: Region,
     changes: &[Change],
     stage: &StageView,
     found: &ViewDisparity,
     options: &StageOptions,
 ) -> GrayImage {
-    let (width, height) = changes[k].changed.dimensions();
-    let labels: Vec<Label> = (0..(width * height) as usize)
-        .map(|i| label(rectification, k, i, changes, stage.disparity.as_raw()[i], found.disparity.as_raw()[i], options))
-        .collect();
+    let canvas = rectification.size_px[0] as usize;
+    let [disparity, ground] = [&found.disparity, &stage.disparity].map(|plane| region.cut(plane, canvas));
+    let places = region.rows(canvas).flatten().zip(changes[k].shaded(region));
+    let at = |((i, shaded), (d, stage)): ((usize, bool), (&f32, &f32))| label(rectification, k, i, changes, shaded, [*d, *stage], options);
+    let labels: Vec<Label> = places.zip(disparity.iter().zip(&ground)).map(at).collect();
     let density =
-        |wanted: Label| blur(&labels.iter().map(|&l| if l == wanted { 1.0 } else { 0.0 }).collect::<Vec<_>>(), width as usize, 2.0);
-    let (person, ground) = (density(Label::Person), density(Label::Stage));
-    let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && person[i] > ground[i]);
-    let mut mask = GrayImage::from_fn(width, height, |x, y| Luma([if set((y * width + x) as usize) { 255 } else { 0 }]));
+        |wanted: Label| blur(&labels.iter().map(|&l| if l == wanted { 1.0 } else { 0.0 }).collect::<Vec<_>>(), region.width(), 2.0);
+    let (person, stage) = (density(Label::Person), density(Label::Stage));
+    let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && person[i] > stage[i]);
+    let mut mask = mask_of(region, set);
     mask = regions::box_vote(&mask, 1, 0.5);
     mask = regions::keep_large(&mask, options.smallest_piece_px);
-    mask = bridge(rectification, &mask, &found.disparity, &stage.disparity, options);
+    mask = bridge(rectification, &mask, region, &disparity, &ground, options);
     mask = regions::fill_holes(&mask, options.largest_hole_px);
-    trim_outline(&mut mask, &changes[k].difference);
+    trim_outline(&mut mask, &region.cut(&changes[k].difference, canvas));
     mask
+}
+
+/// A mask of the size of a region from its pixels' indices.
+fn mask_of(region: Region, set: impl Fn(usize) -> bool) -> GrayImage {
+    let pixels = (0..region.width() * region.height()).map(|i| if set(i) { 255 } else { 0 }).collect();
+    GrayImage::from_raw(region.width() as u32, region.height() as u32, pixels).expect("one value per pixel")
 }
 
 /// Gaps in the mask of up to twice this are bridged, px.
 const BRIDGE_PX: u32 = 4;
 
 /// Joins to the mask what lies between its parts and stands before the stage, though its grey is the stage's: bare skin.
-fn bridge(rectification: &Rectification, mask: &GrayImage, disparity: &Plane, stage: &Plane, options: &StageOptions) -> GrayImage {
+fn bridge(
+    rectification: &Rectification,
+    mask: &GrayImage,
+    region: Region,
+    disparity: &[f32],
+    stage: &[f32],
+    options: &StageOptions,
+) -> GrayImage {
     let closed = regions::close(mask, BRIDGE_PX);
-    let before = |i: usize| {
-        let (d, s) = (disparity.as_raw()[i], stage.as_raw()[i]);
-        d - s > clearance(rectification, s, options.clearance_m).max(options.clearance_px)
-    };
-    let joins = |i: usize| mask.as_raw()[i] != 0 || (closed.as_raw()[i] != 0 && before(i));
-    let width = mask.width() as usize;
-    GrayImage::from_fn(mask.width(), mask.height(), |x, y| Luma([if joins(y as usize * width + x as usize) { 255 } else { 0 }]))
+    let before = |d: f32, stage: f32| d - stage > clearance(rectification, stage, options.clearance_m).max(options.clearance_px);
+    mask_of(region, |i| mask.as_raw()[i] != 0 || (closed.as_raw()[i] != 0 && before(disparity[i], stage[i])))
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -266,12 +308,11 @@ fn label(
     k: usize,
     i: usize,
     changes: &[Change],
-    stage_px: f32,
-    disparity: f32,
+    shaded: bool,
+    [disparity, stage_px]: [f32; 2],
     options: &StageOptions,
 ) -> Label {
     let changed = changes[k].changed.as_raw()[i] != 0;
-    let shaded = changes[k].shaded.as_raw()[i] != 0;
     let spread = if changed { ratio_spread(rectification, k, i, changes, stage_px) } else { None };
     let shaded = match spread {
         Some(spread) => changes[k].ratio[i] < 0.0 && (spread < SAME_RATIO || (shaded && spread < OTHER_RATIO)),
@@ -340,8 +381,22 @@ fn trim_outline(mask: &mut GrayImage, difference: &[f32]) {
             let around = (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| y * width + x));
             let strongest = around.map(|j| difference[j].abs()).fold(0.0, f32::max);
             if difference[i].abs() < 0.5 * strongest {
-                mask.put_pixel(x as u32, y as u32, Luma([0]));
+                mask.put_pixel(x as u32, y as u32, image::Luma([0]));
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn logarithms_meet_the_library() {
+        for i in 0..3000 {
+            let x = 5.0 + 0.087 * i as f32;
+            assert!((ln(x) - x.ln()).abs() < 3e-6, "{x}: {} {}", ln(x), x.ln());
+        }
+        assert!(logarithm(f32::NAN).is_nan() && (logarithm(-3.0) - DARK.ln()).abs() < 3e-6);
     }
 }

@@ -76,6 +76,27 @@ pub struct Refined {
     pub sigma_px: Plane,
 }
 
+/// Another view, for the pixels of a part of the reference.
+#[derive(Clone, Copy)]
+pub struct Other<'a> {
+    plane: &'a Plane,
+    step: Vector2<f32>,
+    corner: Vector2<f32>,
+}
+
+impl<'a> Other<'a> {
+    /// `step` is against the reference, `corner` the part's first pixel.
+    pub fn new(plane: &'a Plane, step: Vector2<f64>, corner: [usize; 2]) -> Self {
+        Self { plane, step: step.map(|s| s as f32), corner: Vector2::from(corner).map(|c| c as f32) }
+    }
+
+    /// Its grey value where it sees pixel (x, y) of the part at disparity d; NaN outside.
+    #[inline]
+    pub fn see(&self, x: f32, y: f32, d: f32) -> f32 {
+        sample(self.plane, self.corner.x + x + d * self.step.x, self.corner.y + y + d * self.step.y)
+    }
+}
+
 /// A view along the surface, per pixel of the reference: grey value at the reference's exposure and g of (2).
 struct Seen {
     value: Vec<f32>,
@@ -92,17 +113,20 @@ struct Fit {
     variance: f32,
 }
 
-/// Refines the disparities of `reference`. `others` are the other views' pictures with their steps against it; bit k of
-/// `confirmed` says that view k agrees. All planes have one size.
-pub fn refine(reference: &Plane, others: &[(&Plane, Vector2<f64>)], disparity: &Plane, confirmed: &[u8]) -> Refined {
+/// Refines the disparities of a part of the reference view, `reference`. Bit k of `confirmed` says that view k of `others`
+/// agrees.
+pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed: &[u8]) -> Refined {
     let (width, height) = disparity.dimensions();
     let mut now = disparity.as_raw().clone();
     let mut fits: Vec<Option<Fit>> = vec![None; now.len()];
+    let weights = window_weights();
+    let here = |other: &Other| slopes(reference, &now, other.step);
+    let here: Vec<Vec<f32>> = others.iter().map(here).collect();
     for _ in 0..ROUNDS {
         let planes: Vec<f32> = per_pixel(&now, |i| plane_at(&now, width as usize, i));
-        let look = |(k, other): (usize, &(&Plane, Vector2<f64>))| look_along(reference, other.0, other.1, &planes, confirmed, 1 << k);
+        let look = |(k, other): (usize, &Other)| look_along(reference, &here[k], other, &planes, confirmed, 1 << k);
         let seen: Vec<Seen> = others.iter().enumerate().map(look).collect();
-        let found: Vec<Option<Fit>> = (0..now.len()).into_par_iter().map(|i| fit_window(reference, &seen, &planes, i)).collect();
+        let found: Vec<Option<Fit>> = (0..now.len()).into_par_iter().map(|i| fit_window(reference, &seen, &planes, &weights, i)).collect();
         for (i, fit) in found.into_iter().enumerate() {
             if let Some(fit) = fit.filter(|f| f.step.abs() < LONGEST_STEP_PX) {
                 now[i] = planes[i] + fit.step;
@@ -110,7 +134,8 @@ pub fn refine(reference: &Plane, others: &[(&Plane, Vector2<f64>)], disparity: &
             }
         }
     }
-    let sigma = per_pixel(&now, |i| match fits[i].map(|fit| sigma_px(&fit, jump_px(&now, width as usize, i))) {
+    let nearest = extremes(&now, width as usize, JUMP_REACH_PX, f32::max);
+    let sigma = per_pixel(&now, |i| match fits[i].map(|fit| sigma_px(&fit, (nearest[i] - now[i]).min(3.0))) {
         Some(sigma) if sigma <= LARGEST_SIGMA_PX => sigma,
         _ => f32::NAN,
     });
@@ -134,29 +159,40 @@ pub(super) fn around(i: usize, radius: isize, width: usize, count: usize) -> imp
 /// D of (2) at pixel `i`: least squares over the neighbours on its surface, with a little weight on no slope where they are few.
 fn plane_at(disparity: &[f32], width: usize, i: usize) -> f32 {
     let here = disparity[i];
-    let (mut normal, mut right) = (Matrix3::from_diagonal(&Vector3::new(0.0, 0.5, 0.5)), Vector3::zeros());
+    // Sums of 1, x, y, x², xy, y², and of d, d x, d y.
+    let (mut normal, mut right) = ([0.0, 0.0, 0.0, 0.5, 0.0, 0.5], [0.0; 3]);
     for (dx, dy, j) in around(i, PLANE_PX, width, disparity.len()) {
         let d = disparity[j] - here;
         if d.abs() <= SAME_SURFACE_PX {
-            let row = Vector3::new(1.0, dx as f32, dy as f32);
-            normal += row * row.transpose();
-            right += row * d;
+            let (x, y) = (dx as f32, dy as f32);
+            normal.iter_mut().zip([1.0, x, y, x * x, x * y, y * y]).for_each(|(sum, v)| *sum += v);
+            right.iter_mut().zip([d, d * x, d * y]).for_each(|(sum, v)| *sum += v);
         }
     }
-    here + normal.cholesky().map_or(0.0, |c| c.solve(&right)[0])
+    let [n, x, y, xx, xy, yy] = normal;
+    let normal = Matrix3::new(n, x, y, x, xx, xy, y, xy, yy);
+    here + normal.cholesky().map_or(0.0, |c| c.solve(&Vector3::from(right))[0])
 }
 
-/// The other view where it sees the surface; NaN where it does not confirm it.
-fn look_along(reference: &Plane, other: &Plane, step: Vector2<f64>, planes: &[f32], confirmed: &[u8], bit: u8) -> Seen {
-    let (width, step) = (reference.width() as usize, step.map(|s| s as f32));
+/// Derivative of the reference's picture along a step, where there is a disparity.
+fn slopes(reference: &Plane, disparity: &[f32], step: Vector2<f32>) -> Vec<f32> {
+    let width = reference.width() as usize;
+    per_pixel(disparity, |i| {
+        let at = |d: f32| sample(reference, (i % width) as f32 + d * step.x, (i / width) as f32 + d * step.y);
+        at(0.5) - at(-0.5)
+    })
+}
+
+/// The other view where it sees the surface; NaN where it does not confirm it. `here` are the reference's own derivatives.
+fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], confirmed: &[u8], bit: u8) -> Seen {
+    let width = reference.width() as usize;
     let one = |(i, &d): (usize, &f32)| {
         if d.is_nan() || confirmed[i] & bit == 0 {
             return (f32::NAN, [f32::NAN; 2]);
         }
         let (x, y) = ((i % width) as f32, (i / width) as f32);
-        let there = |d: f32| sample(other, x + d * step.x, y + d * step.y);
-        let here = |d: f32| sample(reference, x + d * step.x, y + d * step.y);
-        (there(d), [there(d + 0.5) - there(d - 0.5), here(0.5) - here(-0.5)])
+        let there = |d: f32| other.see(x, y, d);
+        (there(d), [there(d + 0.5) - there(d - 0.5), here[i]])
     };
     let samples: Vec<(f32, [f32; 2])> = planes.par_iter().enumerate().map(one).collect();
     let (gain, offset) = exposure(samples.iter().zip(reference.iter()).map(|(s, r)| (*r, s.0)));
@@ -176,8 +212,16 @@ fn exposure(pairs: impl Iterator<Item = (f32, f32)>) -> (f32, f32) {
     if gain.is_finite() && gain > 0.0 { (gain as f32, (b - gain * a) as f32) } else { (1.0, 0.0) }
 }
 
+/// w of (2), row by row.
+type WindowWeights = [[f32; 2 * WINDOW_PX as usize + 1]; 2 * WINDOW_PX as usize + 1];
+
+fn window_weights() -> WindowWeights {
+    let squared = |k: usize| (k as f32 - WINDOW_PX as f32).powi(2);
+    std::array::from_fn(|y| std::array::from_fn(|x| (-0.5 * (squared(x) + squared(y)) / (SPREAD_PX * SPREAD_PX)).exp()))
+}
+
 /// Equation (2) at pixel `i`; `None` without a view or without texture.
-fn fit_window(reference: &Plane, seen: &[Seen], planes: &[f32], i: usize) -> Option<Fit> {
+fn fit_window(reference: &Plane, seen: &[Seen], planes: &[f32], weights: &WindowWeights, i: usize) -> Option<Fit> {
     let (here, grey) = (planes[i], reference.as_raw());
     if here.is_nan() {
         return None;
@@ -187,7 +231,7 @@ fn fit_window(reference: &Plane, seen: &[Seen], planes: &[f32], i: usize) -> Opt
         if (planes[j] - here).abs() > SAME_SURFACE_PX {
             continue;
         }
-        let w = (-0.5 * (dx * dx + dy * dy) as f32 / (SPREAD_PX * SPREAD_PX)).exp();
+        let w = weights[(dy + WINDOW_PX) as usize][(dx + WINDOW_PX) as usize];
         for view in seen {
             let (g, e) = (view.slope[j], view.value[j] - grey[j]);
             if !(g + e).is_nan() {
@@ -211,24 +255,37 @@ fn sigma_px(fit: &Fit, jump_px: f32) -> f32 {
     (NOISE_SHARE * noise + MISFIT_SHARE * misfit + JUMP_SHARE * jump_px * jump_px).sqrt()
 }
 
-/// j of (3).
-fn jump_px(disparity: &[f32], width: usize, i: usize) -> f32 {
-    let nearest = around(i, JUMP_REACH_PX as isize, width, disparity.len()).map(|(_, _, j)| disparity[j]).fold(disparity[i], f32::max);
-    (nearest - disparity[i]).min(3.0)
+/// The most extreme known value around every pixel, up to `reach` rows and columns away; `pick` is the minimum or the maximum.
+pub(super) fn extremes(values: &[f32], width: usize, reach: usize, pick: impl Fn(f32, f32) -> f32) -> Vec<f32> {
+    let height = values.len() / width.max(1);
+    let mut padded = vec![f32::NAN; width + 2 * reach];
+    let mut across = vec![f32::NAN; values.len()];
+    for (out, row) in across.chunks_exact_mut(width.max(1)).zip(values.chunks_exact(width.max(1))) {
+        padded[reach..][..width].copy_from_slice(row);
+        (0..=2 * reach).for_each(|k| out.iter_mut().zip(&padded[k..]).for_each(|(o, v)| *o = pick(*o, *v)));
+    }
+    let mut all = vec![f32::NAN; values.len()];
+    for (y, out) in all.chunks_exact_mut(width.max(1)).enumerate() {
+        let rows = y.saturating_sub(reach)..(y + reach + 1).min(height);
+        rows.for_each(|y| out.iter_mut().zip(&across[y * width..]).for_each(|(o, v)| *o = pick(*o, *v)));
+    }
+    all
 }
 
 /// Catmull-Rom interpolation; NaN at the border and beside unknown pixels.
-pub(super) fn sample(plane: &Plane, x: f32, y: f32) -> f32 {
-    let (x0, y0) = (x.floor(), y.floor());
-    let (width, height) = (plane.width() as isize, plane.height() as isize);
-    let (left, top) = (x0 as isize - 1, y0 as isize - 1);
-    if left < 0 || top < 0 || left + 4 > width || top + 4 > height {
+fn sample(plane: &Plane, x: f32, y: f32) -> f32 {
+    if !(x >= 1.0 && y >= 1.0) {
         return f32::NAN;
     }
-    let (across, down) = (catmull_rom(x - x0), catmull_rom(y - y0));
+    let (width, height) = (plane.width() as usize, plane.height() as usize);
+    let (left, top) = (x as usize - 1, y as usize - 1);
+    if left + 4 > width || top + 4 > height {
+        return f32::NAN;
+    }
+    let (across, down) = (catmull_rom(x - (left + 1) as f32), catmull_rom(y - (top + 1) as f32));
     let data = plane.as_raw();
-    let row = |j: isize| {
-        let row = &data[((top + j) * width + left) as usize..][..4];
+    let row = |j: usize| {
+        let row = &data[(top + j) * width + left..][..4];
         across[0] * row[0] + across[1] * row[1] + across[2] * row[2] + across[3] * row[3]
     };
     down[0] * row(0) + down[1] * row(1) + down[2] * row(2) + down[3] * row(3)
@@ -277,7 +334,8 @@ mod tests {
         let views_of: Vec<StereoView> = views.iter().map(|(plane, step)| StereoView { plane: plane.clone(), step: *step }).collect();
         let all = Region { x: [0, SIZE[0] as usize], y: [0, SIZE[1] as usize] };
         let found = match_view(&views_of, 0, all, [5, 45], &StereoOptions::default());
-        let refined = refine(&views[0].0, &[(&views[1].0, views[1].1), (&views[2].0, views[2].1)], &found.disparity, &found.confirmed);
+        let others = [1, 2].map(|k| Other::new(&views[k].0, views[k].1, [0, 0]));
+        let refined = refine(&views[0].0, &others, &found.disparity, &found.confirmed);
         let inner = found.disparity.enumerate_pixels().filter(|(x, y, _)| (60..230).contains(x) && (10..120).contains(y));
         let inner = inner.filter(|(x, y, _)| !refined.disparity.get_pixel(*x, *y).0[0].is_nan());
         inner

@@ -15,13 +15,14 @@ const PIXEL_SIGMA_PX: f64 = 1.0;
 /// σ_d at which the confidence is a half, px: the median on footage with 2 grey levels of noise.
 const HALF_CONFIDENCE_PX: f64 = 0.1;
 
-/// Points of all known disparities of the reference view; `grey` is its picture.
-pub fn triangulate(rectification: &Rectification, refined: &Refined, grey: &Plane) -> Cloud {
+/// Points of all known disparities of a part of the reference view whose first pixel is `corner`; `grey` is the whole picture.
+pub fn triangulate(rectification: &Rectification, refined: &Refined, corner: [usize; 2], grey: &Plane) -> Cloud {
     let known = refined.disparity.enumerate_pixels().filter(|(_, _, d)| d.0[0] > 0.0);
     let point = |(u, v, d): (u32, u32, &image::Luma<f32>)| {
+        let sigma_px = f64::from(refined.sigma_px.get_pixel(u, v).0[0]);
+        let [u, v] = [u + corner[0] as u32, v + corner[1] as u32];
         let at = [f64::from(u), f64::from(v), f64::from(d.0[0])];
         let grey = grey.get_pixel(u, v).0[0].round().clamp(0.0, 255.0) as u8;
-        let sigma_px = f64::from(refined.sigma_px.get_pixel(u, v).0[0]);
         CloudPoint {
             position: rectification.world_from_pixel(at[0], at[1], at[2]),
             colour: [grey; 3],

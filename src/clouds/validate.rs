@@ -11,6 +11,7 @@
 //! uniqueness takes bare skin first.
 
 use super::correlate::{Matches, Pair, Scores};
+use crate::footage::regions::Joined;
 use crate::rig::rectify::Plane;
 use image::GrayImage;
 use rayon::prelude::*;
@@ -129,7 +130,10 @@ pub fn remove_speckles(disparity: &mut Plane, area_px: usize, step_px: f32) {
     };
     let rows: Vec<Vec<[u32; 2]>> = disparity.as_raw().par_chunks_exact(width).map(runs_of).collect();
     let firsts: Vec<usize> = rows.iter().scan(0, |sum, runs| Some(std::mem::replace(sum, *sum + runs.len()))).collect();
-    let mut parents: Vec<u32> = (0..rows.iter().map(Vec::len).sum::<usize>() as u32).collect();
+    let mut joined = Joined::default();
+    rows.iter().flatten().for_each(|_| {
+        joined.add();
+    });
     for y in 1..rows.len() {
         let (above, here) = (&disparity.as_raw()[(y - 1) * width..][..width], &disparity.as_raw()[y * width..][..width]);
         let mut upper = 0;
@@ -140,38 +144,25 @@ pub fn remove_speckles(disparity: &mut Plane, area_px: usize, step_px: f32) {
             for (j, other) in rows[y - 1].iter().enumerate().skip(upper).take_while(|(_, other)| other[0] < run[1]) {
                 let shared = run[0].max(other[0]) as usize..run[1].min(other[1]) as usize;
                 if shared.into_iter().any(|x| near(above[x], here[x])) {
-                    join(&mut parents, firsts[y] + k, firsts[y - 1] + j);
+                    joined.join(firsts[y] + k, firsts[y - 1] + j);
                 }
             }
         }
     }
-    let mut areas = vec![0; parents.len()];
+    let mut areas = vec![0; rows.iter().map(Vec::len).sum()];
     for (runs, first) in rows.iter().zip(&firsts) {
         for (k, run) in runs.iter().enumerate() {
-            areas[root(&mut parents, first + k)] += (run[1] - run[0]) as usize;
+            areas[joined.first(first + k)] += (run[1] - run[0]) as usize;
         }
     }
     let values: &mut [f32] = disparity;
     for ((runs, first), row) in rows.iter().zip(&firsts).zip(values.chunks_exact_mut(width)) {
         for (k, run) in runs.iter().enumerate() {
-            if areas[root(&mut parents, first + k)] < area_px {
+            if areas[joined.first(first + k)] < area_px {
                 row[run[0] as usize..run[1] as usize].fill(f32::NAN);
             }
         }
     }
-}
-
-fn root(parents: &mut [u32], mut i: usize) -> usize {
-    while parents[i] as usize != i {
-        parents[i] = parents[parents[i] as usize];
-        i = parents[i] as usize;
-    }
-    i
-}
-
-fn join(parents: &mut [u32], a: usize, b: usize) {
-    let (a, b) = (root(parents, a), root(parents, b));
-    parents[a.max(b)] = a.min(b) as u32;
 }
 
 #[cfg(test)]

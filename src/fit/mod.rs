@@ -7,7 +7,6 @@
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
 pub mod curve;
-pub mod journal;
 pub mod people;
 pub mod problem;
 pub mod start;
@@ -28,8 +27,6 @@ use crate::math::arrow::{LmOptions, minimise};
 use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
 use curve::Curve;
-pub use journal::Journal;
-use journal::Under;
 use problem::{Frame, Free, Known, Outside, Problem, Settings};
 use state::{State, Turns};
 pub use targets::Observation;
@@ -51,7 +48,7 @@ pub enum FitError {
     Crowd { crowded: usize, frames: usize },
     #[error("the motion model holds no cycles; build it again with `muybridge model build`")]
     EmptyModel,
-    #[error("interrupted; run the same command to go on")]
+    #[error("interrupted; nothing was written, run the same command to begin again")]
     Interrupted,
 }
 
@@ -140,65 +137,67 @@ const STYLED: Free = Free { weights: true, stature: true, widths: true, ..TURNED
 const SHAPED: Free = Free { lengths: true, ..STYLED };
 const POSED: Free = Free { posture: true, ..SHAPED };
 
+/// A stage of the fit between two of its rounds.
+#[derive(Clone, Debug)]
+pub struct Checkpoint {
+    /// Done in this stage.
+    pub rounds: usize,
+    /// Solver iterations in this stage.
+    pub iterations: u64,
+    /// At the beginning of the last round.
+    pub cost: f64,
+    pub state: State,
+}
+
+/// Where a fit that was stopped goes on, by the number of the stage. argmin's own checkpoints do not serve: weights are frozen
+/// anew for every iteration, so each of its runs is one iteration long.
+pub struct Checkpoints<'a> {
+    pub load: &'a dyn Fn(usize) -> Option<Checkpoint>,
+    pub save: &'a dyn Fn(usize, &Checkpoint),
+}
+
+impl Checkpoints<'_> {
+    pub const NONE: Checkpoints<'static> = Checkpoints { load: &|_| None, save: &|_, _| {} };
+}
+
 /// Everything one run needs beside the state.
 struct Run<'a> {
     model: &'a Model,
     known: Known,
-    journal: Journal,
-    /// Stages begun or skipped.
-    begun: usize,
-    watch: &'a Watch<'a>,
-    share: f64,
-}
-
-/// Who looks on while a fit goes on.
-pub struct Watch<'a> {
-    /// Is told the share done and says whether to go on.
-    pub progress: &'a dyn Fn(f64) -> bool,
-    /// Is shown the journal after every iteration.
-    pub keep: &'a dyn Fn(&Journal),
+    iterations: u64,
+    checkpoints: &'a Checkpoints<'a>,
+    /// Stages begun.
+    stages: usize,
 }
 
 impl Run<'_> {
-    fn step(&mut self, share: f64) -> Result<(), FitError> {
-        self.share = share;
-        if (self.watch.progress)(share) { Ok(()) } else { Err(FitError::Interrupted) }
-    }
-
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
-    /// What the journal holds is not done again.
-    fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> Result<State, FitError> {
-        self.begun += 1;
-        if let Some(known) = self.journal.done.get(self.begun - 1) {
-            return Ok(known.clone());
-        }
+    fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
         let settings = Settings { model_m: stage.model_m, phase_acceleration: stage.phase_acceleration, ..SETTINGS };
-        let mut under = self.journal.under.take().unwrap_or(Under { state, refreshes: 0, cost: f64::INFINITY });
-        while under.refreshes < stage.refreshes {
-            let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &under.state);
+        let begun = (self.checkpoints.load)(self.stages);
+        let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, cost: f64::INFINITY, state });
+        while at.rounds < stage.refreshes {
+            let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &at.state);
             let cost = total(&problem.fitness).cost;
-            if (under.cost - cost).abs() < 1e-3 * cost {
+            if (at.cost - cost).abs() < 1e-3 * cost {
                 break;
             }
-            let (state, summary) = minimise(problem, under.state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
-            under = Under { state, refreshes: under.refreshes + 1, cost };
-            self.journal.iterations += summary.iterations;
-            self.journal.under = Some(under.clone());
-            (self.watch.keep)(&self.journal);
-            self.step(self.share)?;
+            let (state, summary) = minimise(problem, at.state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
+            at = Checkpoint { rounds: at.rounds + 1, iterations: at.iterations + summary.iterations, cost, state };
+            (self.checkpoints.save)(self.stages, &at);
         }
-        self.journal.under = None;
-        self.journal.done.push(under.state.clone());
-        Ok(under.state)
+        self.stages += 1;
+        self.iterations += at.iterations;
+        at.state
     }
 
     /// The rough stages, from the mean motion to ten weights, stature and widths.
-    fn rough(&mut self, state: State, frames: &[Frame]) -> Result<State, FitError> {
+    fn rough(&mut self, state: State, frames: &[Frame]) -> State {
         let mean = Curve::new(self.model, 0);
         let ten = Curve::new(self.model, 10);
         let mut state = State { weights: Vec::new(), ..state };
-        state = self.stage(state, frames, &mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 })?;
-        state = self.stage(state, frames, &mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 })?;
+        state = self.stage(state, frames, &mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 });
+        state = self.stage(state, frames, &mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 });
         state.weights = vec![0.0; ten.components()];
         self.stage(state, frames, &ten, &Stage { free: STYLED, model_m: 0.04, phase_acceleration: STEADY_PHASE, refreshes: 8 })
     }
@@ -214,22 +213,23 @@ pub fn fit(
     options: &FitOptions,
     progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
-    resume(observations, rig, model, floor_m, options, Journal::default(), &Watch { progress, keep: &|_| () })
+    resume(observations, rig, model, floor_m, options, &Checkpoints::NONE, progress)
 }
 
-/// [`fit`] that goes on from a journal of the same fit, and keeps it.
+/// [`fit`] with checkpoints, which must be of the same observations, rig, model and options.
 pub fn resume(
     observations: &[Observation],
     rig: &Rig,
     model: &Model,
     floor_m: Option<f64>,
     options: &FitOptions,
-    journal: Journal,
-    watch: &Watch,
+    checkpoints: &Checkpoints,
+    progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
     if model.members.is_empty() {
         return Err(FitError::EmptyModel);
     }
+    let step = |share| if progress(share) { Ok(()) } else { Err(FitError::Interrupted) };
     let up = rig.up.direction();
     let viewpoint = rig.cameras.iter().map(|c| c.centre()).sum::<Vector3<f64>>() / rig.cameras.len().max(1) as f64;
     if observations.len() < start::FEWEST_FRAMES {
@@ -247,48 +247,48 @@ pub fn resume(
         observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
     };
     let sparse = chosen(200, 40);
-    let mut run = Run { model, known, journal, begun: 0, watch, share: 0.0 };
-    run.step(0.0)?;
+    step(0.0)?;
     let mean = Curve::new(model, 0);
     let search = Settings { model_m: 0.06, ..SETTINGS };
     let found = start::hypotheses(&track, &sparse, &mean, model, &search, &known);
-    run.step(0.1)?;
+    let mut run = Run { model, known, iterations: 0, checkpoints, stages: 0 };
+    step(0.1)?;
     let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
     let ten = Curve::new(model, 10);
     let mut candidates: Vec<(f64, State)> = pair(&found)
         .into_iter()
         .map(|h| {
-            let state = run.rough(h.state.clone(), &sparse)?;
-            Ok((total(&fitness(&ten, &sparse, &rough_settings, &known, &state)).cost, state))
+            let state = run.rough(h.state.clone(), &sparse);
+            (total(&fitness(&ten, &sparse, &rough_settings, &known, &state)).cost, state)
         })
-        .collect::<Result<_, FitError>>()?;
+        .collect();
     candidates.sort_by(|a, b| a.0.total_cmp(&b.0));
     let hypotheses = [candidates[0].0, candidates.last().map_or(candidates[0].0, |c| c.0)];
     let mut state = candidates.swap_remove(0).1;
 
     let dense = chosen(options.points, options.rays);
-    run.step(0.4)?;
+    step(0.4)?;
     let shaped = if options.lengths { SHAPED } else { STYLED };
     let last = Stage { free: shaped, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
-    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last })?;
-    run.step(0.55)?;
+    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
+    step(0.55)?;
     let curve = Curve::new(model, options.components);
     state.weights.resize(curve.components(), 0.0);
-    state = run.stage(state, &dense, &curve, &last)?;
-    run.step(0.7)?;
+    state = run.stage(state, &dense, &curve, &last);
+    step(0.7)?;
     let mut free = shaped;
     let posed = Free { lengths: options.lengths, ..POSED };
     if options.deviations {
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
-        let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last })?;
-        run.step(0.85)?;
+        let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
+        step(0.85)?;
         let left_out: Vec<Frame> = observations.iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &SETTINGS, &known, state)).cost;
         if cost(&own) < cost(&state) {
             (state, free) = (own, posed);
         }
     }
-    run.step(0.95)?;
+    step(0.95)?;
     Ok(finish(run, state, free, curve, &dense, observations, hypotheses))
 }
 
@@ -310,7 +310,7 @@ fn finish(run: Run, state: State, free: Free, curve: Curve, frames: &[Frame], ob
         state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.known.up * d.dot(&run.known.up)).norm()).sum();
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
     let up = run.known.up;
-    Fit { up, poses, uncertainty, frames, hypotheses, iterations: run.journal.iterations, speed_m_s, cadence_hz, state, curve }
+    Fit { up, poses, uncertainty, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
 }
 
 impl Fit {

@@ -151,7 +151,7 @@ mod tests {
         let fit = made_up(&mut ChaCha8Rng::seed_from_u64(6));
         let clip = steady(&fit, 90.0, 3.0).unwrap();
         assert_eq!(clip.poses.len(), 300);
-        let cycle = &clip.poses[100].root - &clip.poses[0].root;
+        let cycle = clip.poses[100].root - clip.poses[0].root;
         assert!((cycle - Vector3::z() * (1.2 / 0.9)).norm() < 1e-9, "{cycle}");
         assert!(clip.poses[100].joints[4].angle_to(&clip.poses[0].joints[4]) < 1e-7);
         assert!(steady(&Fit { cadence_hz: 0.0, ..fit }, 90.0, 3.0).is_none());

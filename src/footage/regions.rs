@@ -3,7 +3,8 @@
 //! What lies outside the picture counts neither as inside nor as outside. Checked against cv::dilate, cv::erode and
 //! cv::connectedComponents.
 
-use image::{GrayImage, Luma};
+use image::GrayImage;
+use std::ops::Range;
 
 const ON: u8 = 255;
 
@@ -46,19 +47,21 @@ pub fn close(mask: &GrayImage, radius_px: u32) -> GrayImage {
 
 /// Keeps the 8-connected regions of at least `smallest_px` pixels.
 pub fn keep_large(mask: &GrayImage, smallest_px: usize) -> GrayImage {
-    keep(mask, |piece| piece.len() >= smallest_px)
+    keep(mask, |piece| runs_area_px(piece) >= smallest_px)
 }
 
 /// Keeps the 8-connected regions that hold a pixel of `seeds`.
 pub fn keep_seeded(mask: &GrayImage, seeds: &GrayImage) -> GrayImage {
     let seeds = seeds.as_raw();
-    keep(mask, |piece| piece.iter().any(|&i| seeds.get(i).is_some_and(|&s| s > 0)))
+    let width = mask.width() as usize;
+    let seeded = |run: &Run| seeds.get(run.pixels(width)).is_some_and(|part| part.iter().any(|&s| s > 0));
+    keep(mask, |piece| piece.iter().any(seeded))
 }
 
-fn keep(mask: &GrayImage, wanted: impl Fn(&[usize]) -> bool) -> GrayImage {
+fn keep(mask: &GrayImage, wanted: impl Fn(&[Run]) -> bool) -> GrayImage {
     let mut pixels = vec![0; mask.as_raw().len()];
-    for piece in pieces(mask, true).iter().filter(|p| wanted(p)) {
-        piece.iter().for_each(|&i| pixels[i] = ON);
+    for run in runs(mask, true).iter().filter(|p| wanted(p)).flatten() {
+        pixels[run.pixels(mask.width() as usize)].fill(ON);
     }
     with_pixels(mask, pixels)
 }
@@ -66,40 +69,100 @@ fn keep(mask: &GrayImage, wanted: impl Fn(&[usize]) -> bool) -> GrayImage {
 /// Fills holes (4-connected, off the border) of at most `largest_px` pixels.
 pub fn fill_holes(mask: &GrayImage, largest_px: usize) -> GrayImage {
     let (width, height) = (mask.width() as usize, mask.height() as usize);
-    let on_border = |i: &usize| i.is_multiple_of(width) || i % width == width - 1 || i / width == 0 || i / width == height - 1;
+    let on_border = |run: &Run| run.from == 0 || run.to == width || run.y == 0 || run.y + 1 == height;
     let mut pixels = mask.as_raw().clone();
-    for hole in pieces(&invert(mask), false).iter().filter(|p| p.len() <= largest_px && !p.iter().any(on_border)) {
-        hole.iter().for_each(|&i| pixels[i] = ON);
+    for hole in runs(&invert(mask), false).iter().filter(|p| runs_area_px(p) <= largest_px && !p.iter().any(on_border)) {
+        hole.iter().for_each(|run| pixels[run.pixels(width)].fill(ON));
     }
     with_pixels(mask, pixels)
 }
 
-/// Connected pieces of the mask, each a list of pixel indices, in scan order; neighbours are 8 with `diagonal`, else 4.
-pub fn pieces(mask: &GrayImage, diagonal: bool) -> Vec<Vec<usize>> {
-    let (width, height) = (mask.width() as usize, mask.height() as usize);
-    let mut open: Vec<bool> = mask.iter().map(|&p| p > 0).collect();
-    let mut found = Vec::new();
-    for start in 0..open.len() {
-        if !std::mem::replace(&mut open[start], false) {
-            continue;
-        }
-        let mut piece = vec![start];
-        let mut next = 0;
-        while let Some(&at) = piece.get(next) {
-            next += 1;
-            let (x, y) = (at % width, at / width);
-            for ny in y.saturating_sub(1)..=(y + 1).min(height - 1) {
-                for nx in x.saturating_sub(1)..=(x + 1).min(width - 1) {
-                    let near = ny * width + nx;
-                    if (diagonal || nx == x || ny == y) && std::mem::replace(&mut open[near], false) {
-                        piece.push(near);
-                    }
-                }
-            }
-        }
-        found.push(piece);
+/// Set pixels of row `y` from column `from` to before `to`, with none on either side.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Run {
+    pub y: usize,
+    pub from: usize,
+    pub to: usize,
+}
+
+impl Run {
+    /// Indices of the run's pixels in a picture of this width.
+    pub fn pixels(&self, width: usize) -> Range<usize> {
+        self.y * width + self.from..self.y * width + self.to
     }
-    found
+}
+
+/// Number of pixels of a piece.
+pub fn runs_area_px(piece: &[Run]) -> usize {
+    piece.iter().map(|run| run.to - run.from).sum()
+}
+
+/// Connected pieces of the mask, in scan order, as their pixel indices, in scan order; neighbours are 8 with `diagonal`, else 4.
+pub fn pieces(mask: &GrayImage, diagonal: bool) -> Vec<Vec<usize>> {
+    runs(mask, diagonal).iter().map(|piece| piece.iter().flat_map(|run| run.pixels(mask.width() as usize)).collect()).collect()
+}
+
+/// Connected pieces of the mask, in scan order, as their runs, in scan order; neighbours are 8 with `diagonal`, else 4.
+pub fn runs(mask: &GrayImage, diagonal: bool) -> Vec<Vec<Run>> {
+    let reach = usize::from(diagonal);
+    let mut found: Vec<Run> = Vec::new();
+    let mut joined = Joined::default();
+    let mut above = 0..0;
+    for (y, row) in mask.as_raw().chunks_exact(mask.width().max(1) as usize).enumerate() {
+        let first = found.len();
+        let mut from = 0;
+        while let Some(skipped) = row[from..].iter().position(|&p| p > 0) {
+            from += skipped;
+            let to = row[from..].iter().position(|&p| p == 0).map_or(row.len(), |length| from + length);
+            let own = joined.add();
+            while above.start < above.end && found[above.start].to + reach <= from {
+                above.start += 1;
+            }
+            above.clone().take_while(|&k| found[k].from < to + reach).for_each(|k| joined.join(own, k));
+            found.push(Run { y, from, to });
+            from = to;
+        }
+        above = first..found.len();
+    }
+    let mut places = vec![0; found.len()];
+    let mut grouped: Vec<Vec<Run>> = Vec::new();
+    for (k, run) in found.into_iter().enumerate() {
+        let first = joined.first(k);
+        if first == k {
+            places[k] = grouped.len();
+            grouped.push(Vec::new());
+        }
+        grouped[places[first]].push(run);
+    }
+    grouped
+}
+
+/// Things, numbered from 0, that are joined to pieces (union-find).
+#[derive(Default)]
+pub struct Joined {
+    parents: Vec<usize>,
+}
+
+impl Joined {
+    /// One more, alone; its number.
+    pub fn add(&mut self) -> usize {
+        self.parents.push(self.parents.len());
+        self.parents.len() - 1
+    }
+
+    /// The lowest number in the piece of `k`.
+    pub fn first(&mut self, mut k: usize) -> usize {
+        while self.parents[k] != k {
+            self.parents[k] = self.parents[self.parents[k]];
+            k = self.parents[k];
+        }
+        k
+    }
+
+    pub fn join(&mut self, a: usize, b: usize) {
+        let (a, b) = (self.first(a), self.first(b));
+        self.parents[a.max(b)] = a.min(b);
+    }
 }
 
 /// Number of pixels in the mask.
@@ -108,25 +171,42 @@ pub fn area_px(mask: &GrayImage) -> usize {
 }
 
 /// Sets pixels whose (2r+1)² box holds more than `share` set pixels: 0.5 smooths, 0 dilates, just below 1 erodes.
-pub fn box_vote(mask: &GrayImage, r: i64, share: f64) -> GrayImage {
-    let (width, height) = (i64::from(mask.width()), i64::from(mask.height()));
-    let stride = width as usize + 1;
-    let mut sums = vec![0u32; stride * (height as usize + 1)];
-    for (y, row) in mask.as_raw().chunks_exact(width.max(1) as usize).enumerate() {
-        let mut across = 0;
-        for (x, &v) in row.iter().enumerate() {
-            across += u32::from(v != 0);
-            sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + across;
+pub fn box_vote(mask: &GrayImage, r: usize, share: f64) -> GrayImage {
+    let (width, height) = (mask.width() as usize, mask.height() as usize);
+    let row = |y: usize| &mask.as_raw()[y * width..][..width];
+    let mut set = vec![0; mask.len()];
+    // Of every column the set pixels in the box's rows, and of those the sums up to every column.
+    let mut counts = vec![0u32; width];
+    let mut sums = vec![0u32; width + 1];
+    (0..r.min(height)).for_each(|y| counts.iter_mut().zip(row(y)).for_each(|(n, &v)| *n += u32::from(v != 0)));
+    for (y, out) in set.chunks_exact_mut(width.max(1)).enumerate() {
+        if y + r < height {
+            counts.iter_mut().zip(row(y + r)).for_each(|(n, &v)| *n += u32::from(v != 0));
+        }
+        if y > r {
+            counts.iter_mut().zip(row(y - r - 1)).for_each(|(n, &v)| *n -= u32::from(v != 0));
+        }
+        if counts.iter().all(|&n| n == 0) {
+            continue;
+        }
+        let rows = (y + r + 1).min(height) - y.saturating_sub(r);
+        let least = |columns: usize| (share * (rows * columns) as f64).floor() as u32 + 1;
+        sums[1..].iter_mut().zip(&counts).fold(0, |sum, (total, n)| {
+            *total = sum + n;
+            *total
+        });
+        let inner = r..width.saturating_sub(r).max(r);
+        let ends = (0..inner.start.min(width)).chain(inner.end.min(width)..width);
+        for x in ends {
+            let (from, to) = (x.saturating_sub(r), (x + r + 1).min(width));
+            out[x] = if sums[to] - sums[from] >= least(to - from) { ON } else { 0 };
+        }
+        let (least, inner) = (least(2 * r + 1), inner.start.min(width)..inner.end.min(width));
+        for ((out, from), to) in out[inner].iter_mut().zip(&sums).zip(sums.iter().skip(2 * r + 1)) {
+            *out = if to - from >= least { ON } else { 0 };
         }
     }
-    GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
-        let (x, y) = (i64::from(x), i64::from(y));
-        let (x0, x1) = ((x - r).max(0) as usize, (x + r + 1).min(width) as usize);
-        let (y0, y1) = ((y - r).max(0) as usize, (y + r + 1).min(height) as usize);
-        let inside = sums[y1 * stride + x1] + sums[y0 * stride + x0] - sums[y0 * stride + x1] - sums[y1 * stride + x0];
-        let all = (x1 - x0) * (y1 - y0);
-        Luma([if f64::from(inside) > share * all as f64 { 255 } else { 0 }])
-    })
+    with_pixels(mask, set)
 }
 
 fn or_into(target: &mut [u8], source: &[u8]) {
@@ -147,6 +227,7 @@ pub(super) fn with_pixels(like: &GrayImage, pixels: Vec<u8>) -> GrayImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use image::Luma;
     use opencv::core::{BORDER_CONSTANT, Mat, Point, Size};
     use opencv::imgproc;
     use opencv::prelude::*;

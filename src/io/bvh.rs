@@ -2,7 +2,7 @@
 //!
 //! Rotation of a joint = product of its channels' rotations, left to right as listed; position channels replace the
 //! offset. BVH names no unit: see [`mapping`](super::mapping). Read: any channel order, also per joint, CRLF, tabs, leaves
-//! without end site. Written: y up, metres, ZXY degrees, H-Anim names, zero rotations = our rest pose, and a side-car JSON.
+//! without end site. Written: y up, metres, degrees in ZXY or another order, H-Anim names, zero rotations = our rest pose, and a side-car JSON.
 //! Checked against an independent reader's forward kinematics on 92 files of many tools.
 
 use std::fmt::Write;
@@ -14,6 +14,7 @@ use super::mapping::{RecordedFrame, RecordedJoint, Recording, tidy_fps};
 use super::sidecar::Sidecar;
 use super::write_atomic;
 use crate::body::{Clip, Joint, Pose};
+use crate::math::euler::{self, Order};
 
 #[derive(Debug, thiserror::Error)]
 pub enum BvhError {
@@ -223,35 +224,41 @@ fn parse_frame(hierarchy: &Hierarchy, line: usize, text: &str) -> Result<Recorde
 
 /// Writes a clip and its side-car `path` with `.json`; `clip_from_rig` is the rotation from the rig's world, if any.
 pub fn write_clip(path: &Path, clip: &Clip, clip_from_rig: Option<&Rotation3<f64>>) -> Result<(), BvhError> {
-    let write = |path: &Path, bytes: &[u8]| write_atomic(path, bytes).map_err(|cause| BvhError::Write { path: path.into(), cause });
-    write(path, text_of(clip).as_bytes())?;
-    write(&path.with_extension("json"), Sidecar::of_bvh(clip, clip_from_rig).to_json().as_bytes())
+    write_clip_in(path, clip, clip_from_rig, Order::ZXY)
 }
 
-fn text_of(clip: &Clip) -> String {
+/// The same with the rotation channels in another order.
+pub fn write_clip_in(path: &Path, clip: &Clip, clip_from_rig: Option<&Rotation3<f64>>, order: Order) -> Result<(), BvhError> {
+    let write = |path: &Path, bytes: &[u8]| write_atomic(path, bytes).map_err(|cause| BvhError::Write { path: path.into(), cause });
+    write(path, text_of(clip, order).as_bytes())?;
+    write(&path.with_extension("json"), Sidecar::of_bvh(clip, clip_from_rig, order).to_json().as_bytes())
+}
+
+fn text_of(clip: &Clip, order: Order) -> String {
     let mut text = String::from("HIERARCHY\n");
-    write_joint(&mut text, clip, Joint::Root, 0);
+    write_joint(&mut text, clip, order, Joint::Root, 0);
     // Writing to a String cannot fail.
     let _ = write!(text, "MOTION\nFrames: {}\nFrame Time: {:.8}\n", clip.poses.len(), 1.0 / clip.fps);
     let mut previous = vec![[0.0; 3]; Joint::ALL.len()];
     for pose in &clip.poses {
-        write_frame(&mut text, pose, &mut previous);
+        write_frame(&mut text, pose, order, &mut previous);
     }
     text
 }
 
 /// Joints depth first, as the format wants them.
-fn write_joint(text: &mut String, clip: &Clip, joint: Joint, depth: usize) {
+fn write_joint(text: &mut String, clip: &Clip, order: Order, joint: Joint, depth: usize) {
+    let rotations = order.axes().map(|axis| ["Xrotation", "Yrotation", "Zrotation"][axis]).join(" ");
     let indent = "  ".repeat(depth);
     let vector = |v: Vector3<f64>| format!("{:.6} {:.6} {:.6}", v.x, v.y, v.z);
     let (kind, offset, channels) = match joint {
-        Joint::Root => ("ROOT", Vector3::zeros(), "6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"),
-        _ => ("JOINT", clip.offsets[joint as usize], "3 Zrotation Xrotation Yrotation"),
+        Joint::Root => ("ROOT", Vector3::zeros(), "6 Xposition Yposition Zposition"),
+        _ => ("JOINT", clip.offsets[joint as usize], "3"),
     };
     let _ = writeln!(text, "{indent}{kind} {}\n{indent}{{", joint.name());
-    let _ = writeln!(text, "{indent}  OFFSET {}\n{indent}  CHANNELS {channels}", vector(offset));
+    let _ = writeln!(text, "{indent}  OFFSET {}\n{indent}  CHANNELS {channels} {rotations}", vector(offset));
     for child in children(joint) {
-        write_joint(text, clip, child, depth + 1);
+        write_joint(text, clip, order, child, depth + 1);
     }
     if let Some(end) = clip.end_site(joint) {
         let _ = writeln!(text, "{indent}  End Site\n{indent}  {{\n{indent}    OFFSET {}\n{indent}  }}", vector(end));
@@ -271,43 +278,18 @@ fn depth_first(joint: Joint, order: &mut Vec<Joint>) {
     }
 }
 
-fn write_frame(text: &mut String, pose: &Pose, previous: &mut [[f64; 3]]) {
+fn write_frame(text: &mut String, pose: &Pose, order: Order, previous: &mut [[f64; 3]]) {
     let _ = write!(text, "{:.6} {:.6} {:.6}", pose.root.x, pose.root.y, pose.root.z);
-    let mut order = Vec::new();
-    depth_first(Joint::Root, &mut order);
-    for joint in order {
+    let mut joints = Vec::new();
+    depth_first(Joint::Root, &mut joints);
+    for joint in joints {
         let rotation = if joint == Joint::Root { &pose.world_from_root } else { pose.joint(joint) };
-        let angles = zxy_near(rotation, &previous[joint as usize]);
+        let angles = euler::near(rotation, order, &previous[joint as usize]);
         previous[joint as usize] = angles;
-        let [z, x, y] = angles.map(f64::to_degrees);
-        let _ = write!(text, " {z:.6} {x:.6} {y:.6}");
+        let [a, b, c] = angles.map(f64::to_degrees);
+        let _ = write!(text, " {a:.6} {b:.6} {c:.6}");
     }
     text.push('\n');
-}
-
-/// Angles z, x, y of R = Rz Rx Ry, of the two solutions and their turns the one nearest to the frame before, so that curves
-/// stay smooth in an editor.
-pub(crate) fn zxy_near(rotation: &UnitQuaternion<f64>, previous: &[f64; 3]) -> [f64; 3] {
-    use std::f64::consts::{PI, TAU};
-    let r = rotation.to_rotation_matrix();
-    let sin_x = r[(2, 1)].clamp(-1.0, 1.0);
-    let main = if sin_x.abs() < 1.0 - 1e-12 {
-        [(-r[(0, 1)]).atan2(r[(1, 1)]), sin_x.asin(), (-r[(2, 0)]).atan2(r[(2, 2)])]
-    } else {
-        // Gimbal lock: only z ± y is determined.
-        [r[(1, 0)].atan2(r[(0, 0)]) - sin_x.signum() * previous[2], sin_x.asin(), previous[2]]
-    };
-    let other = [main[0] + PI, PI - main[1], main[2] + PI];
-    let near = |angles: [f64; 3]| {
-        let mut turned = angles;
-        for (angle, before) in turned.iter_mut().zip(previous) {
-            *angle -= TAU * ((*angle - before) / TAU).round();
-        }
-        turned
-    };
-    let distance = |a: &[f64; 3]| a.iter().zip(previous).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
-    let (main, other) = (near(main), near(other));
-    if distance(&main) <= distance(&other) { main } else { other }
 }
 
 #[cfg(test)]
@@ -433,24 +415,30 @@ mod tests {
 
     #[test]
     fn a_written_clip_reads_back_here_and_elsewhere() {
+        ["zxy", "xyz", "yxz"].into_iter().for_each(reads_back);
+    }
+
+    fn reads_back(order: &str) {
         let (clip, folder) = (dancing(), tempfile::tempdir().unwrap());
         let path = folder.path().join("new/dance.bvh");
-        write_clip(&path, &clip, Some(&Rotation3::from_euler_angles(-1.5, 0.2, 0.0))).unwrap();
+        let order: Order = order.parse().unwrap();
+        write_clip_in(&path, &clip, Some(&Rotation3::from_euler_angles(-1.5, 0.2, 0.0)), order).unwrap();
         let back = read_clip(&path).unwrap().clip;
         assert_eq!((back.fps, back.poses.len()), (clip.fps, clip.poses.len()));
         assert!((back.hip_height_m - clip.hip_height_m).abs() < 1e-12);
         let elsewhere = plain_reader(&std::fs::read_to_string(&path).unwrap());
-        let mut order = Vec::new();
-        depth_first(Joint::Root, &mut order);
+        let mut joints = Vec::new();
+        depth_first(Joint::Root, &mut joints);
         for ((pose, back_pose), read) in clip.poses.iter().zip(&back.poses).zip(&elsewhere) {
             let (placed, back_placed) = (clip.place(pose), back.place(back_pose));
-            for (joint, elsewhere) in order.iter().zip(read) {
+            for (joint, elsewhere) in joints.iter().zip(read) {
                 assert!((placed.position(*joint) - back_placed.position(*joint)).norm() < 1e-5, "{}", joint.name());
                 assert!((placed.position(*joint) - elsewhere).norm() < 1e-5, "{}", joint.name());
             }
         }
         let sidecar = Sidecar::beside(&path).unwrap();
         assert_eq!((sidecar.length_unit.as_str(), sidecar.fps), ("m", 60.0));
+        assert!(sidecar.rotation_order.starts_with(&order.name()));
         let rows = sidecar.file_from_rig_world.unwrap();
         assert!((rows[1][2] - Rotation3::from_euler_angles(-1.5, 0.2, 0.0)[(1, 2)]).abs() < 1e-12);
     }
@@ -461,21 +449,11 @@ mod tests {
         for (i, pose) in clip.poses.iter_mut().enumerate() {
             pose.world_from_root = exp(&Vector3::new(0.0, 12.0 * i as f64 / 60.0, 0.0));
         }
-        let text = text_of(&clip);
+        let text = text_of(&clip, Order::ZXY);
         let y = |line: &str| line.split(' ').nth(5).and_then(|w| w.parse::<f64>().ok());
         let turns: Vec<f64> = text.lines().skip_while(|l| !l.starts_with("Frame Time")).skip(1).filter_map(y).collect();
         assert_eq!(turns.len(), 61);
         assert!(turns.windows(2).all(|w| (w[1] - w[0] - 12f64.to_degrees() / 60.0).abs() < 1e-5), "{turns:?}");
-    }
-
-    #[test]
-    fn gimbal_lock_keeps_the_rotation() {
-        for sign in [1.0, -1.0] {
-            let lock = exp(&Vector3::new(0.0, 0.0, 0.7)) * exp(&Vector3::new(sign * std::f64::consts::FRAC_PI_2, 0.0, 0.0));
-            let [z, x, y] = zxy_near(&lock, &[0.1, 0.2, 0.3]);
-            let back = exp(&Vector3::new(0.0, 0.0, z)) * exp(&Vector3::new(x, 0.0, 0.0)) * exp(&Vector3::new(0.0, y, 0.0));
-            assert!(back.angle_to(&lock) < 1e-7, "{z} {x} {y}");
-        }
     }
 
     #[test]

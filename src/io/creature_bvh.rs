@@ -10,9 +10,10 @@ use std::path::Path;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::bvh::{self, BvhError, zxy_near};
+use super::bvh::{self, BvhError};
 use super::write_atomic;
 use crate::animal::creature::{Bone, Creature, Local, Motion, Posture, Skin, rotations};
+use crate::math::euler::{self, Order};
 
 /// Reads a skeleton and its motion, named after the file.
 pub fn read(path: &Path) -> Result<Creature, BvhError> {
@@ -68,7 +69,7 @@ fn text_of(creature: &Creature, postures: &[Posture], fps: f64) -> String {
             // Turns since rest in the world, against the parent's.
             let since = |k: usize| turned[k] * rest[k].inverse();
             let own = creature.bones[k].parent.map_or(since(k), |p| since(p).inverse() * since(k));
-            previous[k] = zxy_near(&own, &previous[k]);
+            previous[k] = euler::near(&own, Order::ZXY, &previous[k]);
             values.extend(previous[k].iter().map(|a| format!("{:.6}", a.to_degrees())));
         }
         let _ = writeln!(text, "{}", values.join(" "));

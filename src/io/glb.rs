@@ -1,6 +1,6 @@
 //! Skinned skeletons and their motions as binary glTF 2.0 (GLB), read and written.
 //!
-//! Written: every bone a node, one skin over all of them, one mesh with vertex colours, one animation per motion with
+//! Written: every bone a node, one skin over all of them, one mesh with normals and vertex colours, one animation per motion with
 //! rotations of all bones and translations of those that move; y up, metres if the creature is in metres, seconds.
 //! Read: nodes, skins, triangles and base colours of all meshes, animations (step, linear, cubic spline) at the union of
 //! their key times. Everything must be inside the one file. Checked against the `gltf` crate's own validation and by
@@ -258,6 +258,9 @@ const U8: u32 = 5121;
 const U16: u32 = 5123;
 const U32: u32 = 5125;
 const F32: u32 = 5126;
+/// What buffer views of vertices and of triangles are for.
+const ARRAY_BUFFER: u32 = 34962;
+const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 
 impl Binary {
     /// Adds an accessor over `bytes` and returns its index.
@@ -337,21 +340,43 @@ fn mesh(skin: &Skin, binary: &mut Binary) -> Value {
     let v = &skin.vertices;
     let positions: Vec<[f64; 3]> = v.iter().map(|v| v.position.into()).collect();
     let weights: Vec<[f64; 4]> = v.iter().map(|v| v.weights.map(f64::from)).collect();
+    let normals = normals(skin);
     // Vertex colours are linear.
     let linear = |c: u8| ((f64::from(c) / 255.0).powf(2.2) * 255.0).round() as u8;
     let colours = v.iter().flat_map(|v| [linear(v.colour[0]), linear(v.colour[1]), linear(v.colour[2]), 255]).collect();
-    let bones = v.iter().flat_map(|v| v.bones).flat_map(u16::to_le_bytes).collect();
+    // The format wants no bone where there is no weight.
+    let carrying = |v: &Vertex| -> [u16; 4] { std::array::from_fn(|k| if v.weights[k] > 0.0 { v.bones[k] } else { 0 }) };
+    let bones = v.iter().flat_map(carrying).flat_map(u16::to_le_bytes).collect();
     let corners = skin.triangles.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
-    json!({
+    let first = binary.views.len();
+    let primitive = json!({
         "attributes": {
             "POSITION": binary.floats(&positions, "VEC3", true),
+            "NORMAL": binary.floats(&normals, "VEC3", false),
             "COLOR_0": binary.push(colours, U8, "VEC4", v.len(), json!({ "normalized": true })),
             "JOINTS_0": binary.push(bones, U16, "VEC4", v.len(), json!({})),
             "WEIGHTS_0": binary.floats(&weights, "VEC4", false),
         },
         "indices": binary.push(corners, U32, "SCALAR", 3 * skin.triangles.len(), json!({})),
         "material": 0,
-    })
+    });
+    let count = binary.views.len();
+    for (k, view) in binary.views.iter_mut().enumerate().skip(first) {
+        view["target"] = json!(if k + 1 == count { ELEMENT_ARRAY_BUFFER } else { ARRAY_BUFFER });
+    }
+    primitive
+}
+
+/// Means of the triangles' normals at their corners, by area; viewers shade faces flat without them.
+fn normals(skin: &Skin) -> Vec<[f64; 3]> {
+    let mut sums = vec![Vector3::zeros(); skin.vertices.len()];
+    for corners in &skin.triangles {
+        let place = |k: usize| skin.vertices.get(corners[k] as usize).map(|v| v.position);
+        let (Some(a), Some(b), Some(c)) = (place(0), place(1), place(2)) else { continue };
+        let area = (b - a).cross(&(c - a));
+        corners.iter().for_each(|i| sums[*i as usize] += area);
+    }
+    sums.iter().map(|sum| sum.try_normalize(1e-12).unwrap_or_else(Vector3::y).into()).collect()
 }
 
 fn animation(creature: &Creature, motion: &Motion, binary: &mut Binary) -> Value {

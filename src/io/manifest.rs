@@ -2,13 +2,14 @@
 //!
 //! Columns `file,subject,activity,speed_m_s,length_m,start_s,end_s` in any order, all but `file` optional, empty cells
 //! allowed; `file` is relative to the manifest. A file may have several rows. A `subjects.csv` found in a folder stands for
-//! the whole folder: only the files it lists are used.
+//! the whole folder: only the files it lists are used. A trial that lies in one folder as C3D and as TRC counts once.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::is_motion_file;
+use super::outputs_json::Outputs;
 use crate::motion_model::Activity;
 
 const MANIFEST: &str = "subjects.csv";
@@ -17,7 +18,8 @@ const MANIFEST: &str = "subjects.csv";
 #[derive(Clone, Debug, PartialEq)]
 pub struct Entry {
     pub path: PathBuf,
-    /// As the manifest says, else the name of the file's folder.
+    /// As the manifest says, else the name of the file's folder; folders named after the file or after what they hold
+    /// (`dynamic`, `ik`) are passed over.
     pub subject: String,
     pub activity: Option<Activity>,
     /// Speed in m/s or length in m.
@@ -36,7 +38,7 @@ pub enum ManifestError {
     Column { path: PathBuf, column: String },
     #[error("{path} line {line}: {why}")]
     Row { path: PathBuf, line: usize, why: String },
-    #[error("no motion file (.amc, .bvh, .mot, .sto) in {path}")]
+    #[error("no motion file (.amc, .bvh, .c3d, .mot, .sto, .trc) in {path}")]
     Nothing { path: PathBuf },
 }
 
@@ -72,17 +74,44 @@ fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -
     }
     let mut children: Vec<PathBuf> = fs::read_dir(path).map_err(failed)?.filter_map(|e| Some(e.ok()?.path())).collect();
     children.sort_by(|a, b| natord::compare(&a.to_string_lossy(), &b.to_string_lossy()).then(a.cmp(b)));
-    for child in children {
-        if child.is_dir() || is_motion_file(&child) {
-            search(&child, entries, seen)?;
+    let twin = |child: &Path| is_kind(child, "trc") && children.iter().any(|c| is_kind(c, "c3d") && c.file_stem() == child.file_stem());
+    // What this software wrote stands there in several formats: one of them is enough.
+    let written = Outputs::of_folder(path);
+    let is_copy = |child: &Path| child.file_name().is_some_and(|name| written.is_copy(&name.to_string_lossy()));
+    for child in &children {
+        if child.is_dir() || is_motion_file(child) && !twin(child) && !is_copy(child) {
+            search(child, entries, seen)?;
         }
     }
     Ok(())
 }
 
+fn is_kind(path: &Path, ending: &str) -> bool {
+    path.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending))
+}
+
+/// Folders that say what they hold, not whose it is.
+const KINDS: [&str; 16] =
+    ["dynamic", "static", "ik", "expdata", "markers", "mocap", "trials", "data", "raw", "c3d", "trc", "mot", "bvh", "amc", "walk", "run"];
+
 fn plain(path: &Path) -> Entry {
-    let folder = fs::canonicalize(path).ok().and_then(|p| Some(p.parent()?.file_name()?.to_string_lossy().into_owned()));
-    Entry { path: path.to_path_buf(), subject: folder.unwrap_or_default(), activity: None, parameter: None, start_s: None, end_s: None }
+    Entry {
+        path: path.to_path_buf(),
+        subject: subject_of(path).unwrap_or_default(),
+        activity: None,
+        parameter: None,
+        start_s: None,
+        end_s: None,
+    }
+}
+
+/// The nearest folder's name that can be a person's.
+fn subject_of(path: &Path) -> Option<String> {
+    let path = fs::canonicalize(path).ok()?;
+    let stem = path.file_stem()?.to_string_lossy().into_owned();
+    let folders: Vec<String> = path.parent()?.iter().rev().map(|f| f.to_string_lossy().into_owned()).collect();
+    let is_person = |f: &&String| !KINDS.contains(&f.to_lowercase().as_str()) && !stem.starts_with(&format!("{f}_ik"));
+    folders.iter().find(is_person).or(folders.first()).cloned()
 }
 
 /// The rows of a `subjects.csv`.
@@ -174,6 +203,14 @@ mod tests {
         assert_eq!(names, [("9", "x.amc"), ("12", "a_2.BVH"), ("12", "a_10.bvh")]);
         let empty = folder(&[("notes.txt", "")]);
         assert!(matches!(find_motions(&[empty.path().to_path_buf()], None), Err(ManifestError::Nothing { .. })));
+    }
+
+    #[test]
+    fn subjects_are_not_named_after_kinds_of_files_and_trials_count_once() {
+        let dir = folder(&[("p7/dynamic/w.c3d", ""), ("p7/dynamic/w.trc", ""), ("p7/ik/C4/C4_ik.mot", ""), ("p8/x.trc", "")]);
+        let found = find_motions(&[dir.path().to_path_buf()], None).unwrap();
+        let names: Vec<_> = found.iter().map(|e| (e.subject.as_str(), e.path.file_name().unwrap().to_str().unwrap())).collect();
+        assert_eq!(names, [("p7", "w.c3d"), ("p7", "C4_ik.mot"), ("p8", "x.trc")]);
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use super::asf_amc::{self, AsfAmcError};
 use super::bvh::{self, BvhError};
 use super::mapping::{MappingError, Recording, clip_from_recording};
+use super::markers::{self, MarkersError};
 use super::mot::{self, MotError};
 use super::sidecar::Sidecar;
 use crate::body::Clip;
@@ -17,9 +18,11 @@ pub enum MocapError {
     AsfAmc(#[from] AsfAmcError),
     #[error(transparent)]
     Mot(#[from] MotError),
+    #[error(transparent)]
+    Markers(#[from] MarkersError),
     #[error("{path}: {cause}")]
     Mapping { path: PathBuf, cause: MappingError },
-    #[error("{path}: not a motion file that can be read; give .bvh, .amc (with its .asf beside it), .mot or .sto")]
+    #[error("{path}: not a motion file that can be read; give .bvh, .amc (with its .asf beside it), .c3d, .trc, .mot or .sto")]
     Kind { path: PathBuf },
 }
 
@@ -35,16 +38,17 @@ pub struct ReadClip {
 
 /// True for the endings that [`read_clip`] reads.
 pub fn is_motion_file(path: &Path) -> bool {
-    matches!(ending(path).as_str(), "bvh" | "amc" | "mot" | "sto")
+    matches!(ending(path).as_str(), "bvh" | "amc" | "mot" | "sto" | "c3d" | "trc")
 }
 
-/// Reads `.bvh`, `.amc` (with the `.asf` found beside it), `.mot` or `.sto`.
+/// Reads `.bvh`, `.amc` (with the `.asf` found beside it), `.mot`, `.sto`, or markers (`.c3d`, `.trc`) by inverse kinematics.
 pub fn read_clip(path: &Path) -> Result<ReadClip, MocapError> {
     let mapped = |recording: Recording| clip_from_recording(&recording).map_err(|cause| MocapError::Mapping { path: path.into(), cause });
     let (mut clip, notices) = match ending(path).as_str() {
         "bvh" => mapped(bvh::read(path)?)?,
         "amc" => mapped(asf_amc::read(path)?)?,
         "mot" | "sto" => mot::read(path)?,
+        "c3d" | "trc" => markers::read_clip(path)?,
         _ => return Err(MocapError::Kind { path: path.into() }),
     };
     if let Some(sidecar) = Sidecar::beside(path) {

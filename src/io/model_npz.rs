@@ -15,21 +15,18 @@
 //! BLAKE3 hash covers all arrays and the rest of the header. Checked against numpy's own reading in development.
 
 use std::fs::File;
-use std::io::{BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 
-use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion};
-use npyz::WriterBuilder;
-use npyz::npz::{NpzArchive, NpzWriter};
+use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
+use super::npz::{self, Array, Fault};
 use super::write_atomic;
-use crate::body::{BALL_JOINTS, DOF, Joint};
+use crate::body::{BALL_JOINTS, DOF};
 use crate::motion_model::{Activity, Member, Model, ROOT_CHANNELS, SAMPLES};
 
 const FORMAT: &str = "muybridge-model";
 const VERSION: u32 = 1;
-const SKELETON: &str = "muybridge-hanim-78";
 const VECTOR: usize = SAMPLES * DOF;
 const ROOT: usize = SAMPLES * ROOT_CHANNELS;
 
@@ -43,7 +40,7 @@ pub enum ModelFileError {
     Foreign { path: PathBuf, why: String },
     #[error("{path} is a model of version {found}, this program reads {VERSION}; build it again")]
     Version { path: PathBuf, found: u32 },
-    #[error("{path} is a model of another skeleton ({found}), {SKELETON} is needed; build it again from the recordings")]
+    #[error("{path} is a model of another skeleton ({found}), {} is needed; build it again from the recordings", npz::SKELETON)]
     Skeleton { path: PathBuf, found: String },
     #[error("{path} is damaged: {why}; build or copy it again")]
     Damaged { path: PathBuf, why: String },
@@ -71,8 +68,8 @@ impl Header {
         Header {
             format: FORMAT.into(),
             version: VERSION,
-            skeleton: SKELETON.into(),
-            joints: joint_names(),
+            skeleton: npz::SKELETON.into(),
+            joints: npz::joint_names(),
             samples: SAMPLES,
             root_channels: ["rotation_x", "rotation_y", "rotation_z", "sway", "height", "progress"].map(String::from).into(),
             activity: model.activity,
@@ -84,17 +81,6 @@ impl Header {
             blake3: String::new(),
         }
     }
-}
-
-fn joint_names() -> Vec<String> {
-    Joint::ALL[1..].iter().map(|j| j.name().to_string()).collect()
-}
-
-/// An array of the file: name, shape, values in C order.
-struct Array {
-    name: &'static str,
-    shape: Vec<u64>,
-    values: Vec<f64>,
 }
 
 fn arrays(model: &Model) -> Vec<Array> {
@@ -118,25 +104,9 @@ fn arrays(model: &Model) -> Vec<Array> {
     ]
 }
 
-fn hash(header: &Header, arrays: &[Array]) -> String {
-    let mut hasher = blake3::Hasher::new();
-    // A struct of strings and numbers has no way to fail.
-    hasher.update(&serde_json::to_vec(header).unwrap_or_default());
-    for array in arrays {
-        hasher.update(array.name.as_bytes());
-        for n in &array.shape {
-            hasher.update(&n.to_le_bytes());
-        }
-        for v in &array.values {
-            hasher.update(&v.to_le_bytes());
-        }
-    }
-    hasher.finalize().to_hex().to_string()
-}
-
 /// Hash of a model's content, the one in its file.
 pub fn model_hash(model: &Model) -> String {
-    hash(&Header::of(model), &arrays(model))
+    npz::hash(&Header::of(model), &arrays(model))
 }
 
 /// Writes a model; the same model gives the same bytes.
@@ -149,150 +119,69 @@ pub fn write_model(path: &Path, model: &Model) -> Result<(), ModelFileError> {
 fn encode(model: &Model) -> std::io::Result<Vec<u8>> {
     let arrays = arrays(model);
     let mut header = Header::of(model);
-    header.blake3 = hash(&header, &arrays);
-    archive(&header, arrays)
-}
-
-fn archive(header: &Header, arrays: Vec<Array>) -> std::io::Result<Vec<u8>> {
-    let options = || {
-        zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored).last_modified_time(zip::DateTime::default())
-    };
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
-    let json = serde_json::to_vec_pretty(header)?;
-    let mut writer = npz.array::<u8>("header", options())?.default_dtype().shape(&[json.len() as u64]).begin_nd()?;
-    writer.extend(json)?;
-    writer.finish()?;
-    for array in arrays {
-        let mut writer = npz.array::<f64>(array.name, options())?.default_dtype().shape(&array.shape).begin_nd()?;
-        writer.extend(array.values)?;
-        writer.finish()?;
-    }
-    let cursor = npz.zip_writer().finish().map_err(std::io::Error::other)?;
-    Ok(cursor.into_inner())
+    header.blake3 = npz::hash(&header, &arrays);
+    npz::archive(&header, arrays)
 }
 
 /// Reads a model and checks kind, version, skeleton, shapes and hash.
 pub fn read_model(path: &Path) -> Result<Model, ModelFileError> {
-    let file = File::open(path).map_err(|cause| ModelFileError::Read { path: path.to_path_buf(), cause })?;
-    let npz = NpzArchive::new(BufReader::new(file))
-        .map_err(|e| ModelFileError::Foreign { path: path.to_path_buf(), why: format!("not an .npz archive: {e}") })?;
-    Reader { path, npz }.model()
+    let own = |path: &Path| path.to_path_buf();
+    let file = File::open(path).map_err(|cause| ModelFileError::Read { path: own(path), cause })?;
+    model_of(file).map_err(|fault| match fault {
+        Fault::Foreign(why) => ModelFileError::Foreign { path: own(path), why },
+        Fault::Version(found) => ModelFileError::Version { path: own(path), found },
+        Fault::Skeleton(found) => ModelFileError::Skeleton { path: own(path), found },
+        Fault::Damaged(why) => ModelFileError::Damaged { path: own(path), why },
+    })
 }
 
-struct Reader<'a, R: Read + Seek> {
-    path: &'a Path,
-    npz: NpzArchive<R>,
-}
-
-impl<R: Read + Seek> Reader<'_, R> {
-    fn foreign(&self, why: impl ToString) -> ModelFileError {
-        ModelFileError::Foreign { path: self.path.to_path_buf(), why: why.to_string() }
+fn model_of(file: File) -> Result<Model, Fault> {
+    let mut npz = npz::Reader::new(file)?;
+    let header: Header = npz.header(FORMAT, VERSION)?;
+    if header.samples != SAMPLES {
+        return Err(Fault::Skeleton(format!("{} samples in place of {SAMPLES}", header.samples)));
     }
-
-    fn damaged(&self, why: impl ToString) -> ModelFileError {
-        ModelFileError::Damaged { path: self.path.to_path_buf(), why: why.to_string() }
+    let mean_rotations = npz::rotations(&npz.array("mean_rotations", 4)?.1)?;
+    let (_, mean) = npz.array("mean", 0)?;
+    let (components, basis) = npz.array("basis", VECTOR)?;
+    let (_, eigenvalues) = npz.array("eigenvalues", 0)?;
+    let (_, root_mean) = npz.array("root_mean", 0)?;
+    let (root_components, root_basis) = npz.array("root_basis", ROOT)?;
+    let (members, vectors) = npz.array("vectors", VECTOR)?;
+    let (root_members, roots) = npz.array("roots", ROOT)?;
+    let [(_, parameters), (_, hips), (_, durations)] =
+        [npz.array("parameters", 0)?, npz.array("hip_heights_m", 0)?, npz.array("durations_s", 0)?];
+    let counts = [root_members, parameters.len(), hips.len(), durations.len(), header.subjects.len(), header.sources.len()];
+    let sizes = mean.len() == VECTOR && root_mean.len() == ROOT;
+    if !sizes || counts.iter().any(|&n| n != members) || root_components != components || components == 0 || eigenvalues.len() < components
+    {
+        return Err(Fault::Damaged("its arrays do not fit each other".into()));
     }
-
-    fn header(&mut self) -> Result<Header, ModelFileError> {
-        let bytes = match self.npz.by_name("header") {
-            Ok(Some(array)) => array.into_vec::<u8>().map_err(|e| e.to_string()),
-            Ok(None) => Err("it holds no array `header`".to_string()),
-            Err(e) => Err(e.to_string()),
-        };
-        let bytes = bytes.map_err(|e| self.foreign(e))?;
-        let value: serde_json::Value = serde_json::from_slice(&bytes).map_err(|_| self.foreign("its header is no JSON"))?;
-        if value["format"] != FORMAT {
-            return Err(self.foreign("its header names another format"));
-        }
-        let path = self.path.to_path_buf();
-        let found = value["version"].as_u64().unwrap_or(0) as u32;
-        if found != VERSION {
-            return Err(ModelFileError::Version { path, found });
-        }
-        let found = value["skeleton"].as_str().unwrap_or("unnamed").to_string();
-        if found != SKELETON {
-            return Err(ModelFileError::Skeleton { path, found });
-        }
-        let header: Header = serde_json::from_value(value).map_err(|e| self.damaged(format!("its header: {e}")))?;
-        if header.joints != joint_names() || header.samples != SAMPLES {
-            return Err(ModelFileError::Skeleton { path, found: format!("{} joints, {} samples", header.joints.len(), header.samples) });
-        }
-        Ok(header)
+    let model = Model {
+        activity: header.activity,
+        synthetic: header.synthetic,
+        mean_rotations,
+        mean: DVector::from_vec(mean),
+        basis: DMatrix::from_vec(VECTOR, components, basis),
+        eigenvalues,
+        root_mean: DVector::from_vec(root_mean),
+        root_basis: DMatrix::from_vec(ROOT, components, root_basis),
+        members: (0..members)
+            .map(|i| Member {
+                subject: header.subjects[i].clone(),
+                source: header.sources[i].clone(),
+                parameter: parameters[i],
+                hip_height_m: hips[i],
+                duration_s: durations[i],
+                vector: DVector::from_column_slice(&vectors[i * VECTOR..(i + 1) * VECTOR]),
+                root: DVector::from_column_slice(&roots[i * ROOT..(i + 1) * ROOT]),
+            })
+            .collect(),
+    };
+    if model_hash(&model) != header.blake3 {
+        return Err(Fault::Damaged("its content does not match its hash".into()));
     }
-
-    /// An array of finite numbers with `columns` values per row (0 for a plain vector) and its number of rows.
-    fn array(&mut self, name: &'static str, columns: usize) -> Result<(usize, Vec<f64>), ModelFileError> {
-        let read = match self.npz.by_name(name) {
-            Ok(Some(array)) => {
-                let shape = array.shape().to_vec();
-                let fits = if columns == 0 { shape.len() == 1 } else { shape.len() == 2 && shape[1] == columns as u64 };
-                if fits {
-                    array.into_vec::<f64>().map(|v| (shape[0] as usize, v)).map_err(|e| e.to_string())
-                } else {
-                    Err(format!("shape {shape:?}"))
-                }
-            }
-            Ok(None) => Err("missing".to_string()),
-            Err(e) => Err(e.to_string()),
-        };
-        let (rows, values) = read.map_err(|e| self.damaged(format!("array `{name}`: {e}")))?;
-        if values.len() != rows * columns.max(1) || values.iter().any(|v| !v.is_finite()) {
-            return Err(self.damaged(format!("array `{name}` is cut short or not finite")));
-        }
-        Ok((rows, values))
-    }
-
-    fn model(mut self) -> Result<Model, ModelFileError> {
-        let header = self.header()?;
-        let (_, quaternions) = self.array("mean_rotations", 4)?;
-        let (_, mean) = self.array("mean", 0)?;
-        let (components, basis) = self.array("basis", VECTOR)?;
-        let (_, eigenvalues) = self.array("eigenvalues", 0)?;
-        let (_, root_mean) = self.array("root_mean", 0)?;
-        let (root_components, root_basis) = self.array("root_basis", ROOT)?;
-        let (members, vectors) = self.array("vectors", VECTOR)?;
-        let (root_members, roots) = self.array("roots", ROOT)?;
-        let [(_, parameters), (_, hips), (_, durations)] =
-            [self.array("parameters", 0)?, self.array("hip_heights_m", 0)?, self.array("durations_s", 0)?];
-        let counts = [root_members, parameters.len(), hips.len(), durations.len(), header.subjects.len(), header.sources.len()];
-        let sizes = quaternions.len() == 4 * BALL_JOINTS && mean.len() == VECTOR && root_mean.len() == ROOT;
-        if !sizes
-            || counts.iter().any(|&n| n != members)
-            || root_components != components
-            || components == 0
-            || eigenvalues.len() < components
-        {
-            return Err(self.damaged("its arrays do not fit each other"));
-        }
-        let model = Model {
-            activity: header.activity,
-            synthetic: header.synthetic,
-            mean_rotations: std::array::from_fn(|j| {
-                let q = &quaternions[4 * j..4 * j + 4];
-                UnitQuaternion::new_unchecked(Quaternion::new(q[0], q[1], q[2], q[3]))
-            }),
-            mean: DVector::from_vec(mean),
-            basis: DMatrix::from_vec(VECTOR, components, basis),
-            eigenvalues,
-            root_mean: DVector::from_vec(root_mean),
-            root_basis: DMatrix::from_vec(ROOT, components, root_basis),
-            members: (0..members)
-                .map(|i| Member {
-                    subject: header.subjects[i].clone(),
-                    source: header.sources[i].clone(),
-                    parameter: parameters[i],
-                    hip_height_m: hips[i],
-                    duration_s: durations[i],
-                    vector: DVector::from_column_slice(&vectors[i * VECTOR..(i + 1) * VECTOR]),
-                    root: DVector::from_column_slice(&roots[i * ROOT..(i + 1) * ROOT]),
-                })
-                .collect(),
-        };
-        if model_hash(&model) != header.blake3 {
-            return Err(self.damaged("its content does not match its hash"));
-        }
-        Ok(model)
-    }
+    Ok(model)
 }
 
 #[cfg(test)]
@@ -327,9 +216,9 @@ mod tests {
     fn altered(change: impl Fn(&mut Header, &mut Vec<Array>)) -> Vec<u8> {
         let model = model();
         let (mut header, mut arrays) = (Header::of(&model), arrays(&model));
-        header.blake3 = hash(&header, &arrays);
+        header.blake3 = npz::hash(&header, &arrays);
         change(&mut header, &mut arrays);
-        archive(&header, arrays).unwrap()
+        npz::archive(&header, arrays).unwrap()
     }
 
     #[test]

@@ -55,8 +55,8 @@ const REQUIRED: [&str; 10] = [
 ];
 
 /// Template hip joints from the pelvis' origin, fractions of stature: gait2392's -70.7 and -66.1 mm in a man of 1.80 m.
-const HIP_FORWARD: f64 = -0.0393;
-const HIP_UP: f64 = -0.0367;
+pub(super) const HIP_FORWARD: f64 = -0.0393;
+pub(super) const HIP_UP: f64 = -0.0367;
 
 /// Reads a `.mot` or `.sto`; with the clip come notices, one sentence each.
 pub fn read(path: &Path) -> Result<(Clip, Vec<String>), MotError> {
@@ -201,7 +201,7 @@ impl Row<'_> {
 }
 
 /// OpenSim's X forward, Y up, Z right as ours: x left, y up, z forward.
-fn ours([x, y, z]: [f64; 3]) -> Vector3<f64> {
+pub(super) fn ours([x, y, z]: [f64; 3]) -> Vector3<f64> {
     Vector3::new(-z, y, x)
 }
 
@@ -215,14 +215,14 @@ fn root_from_origin(stature: f64) -> Vector3<f64> {
     stature * Vector3::new(0.0, HIP_UP + rise, HIP_FORWARD)
 }
 
-const X: [f64; 3] = [1.0, 0.0, 0.0];
-const Y: [f64; 3] = [0.0, 1.0, 0.0];
-const Z: [f64; 3] = [0.0, 0.0, 1.0];
-const ANKLE: [f64; 3] = [-0.105014, -0.174022, 0.979126];
-const SUBTALAR: [f64; 3] = [0.787180, 0.604747, -0.120949];
-const TOES: [f64; 3] = [-0.580954, 0.0, 0.813936];
-const ELBOW: [f64; 3] = [0.226047, 0.022269, 0.973862];
-const PRONATION: [f64; 3] = [0.056398, 0.998406, 0.001952];
+pub(super) const X: [f64; 3] = [1.0, 0.0, 0.0];
+pub(super) const Y: [f64; 3] = [0.0, 1.0, 0.0];
+pub(super) const Z: [f64; 3] = [0.0, 0.0, 1.0];
+pub(super) const ANKLE: [f64; 3] = [-0.105014, -0.174022, 0.979126];
+pub(super) const SUBTALAR: [f64; 3] = [0.787180, 0.604747, -0.120949];
+pub(super) const TOES: [f64; 3] = [-0.580954, 0.0, 0.813936];
+pub(super) const ELBOW: [f64; 3] = [0.226047, 0.022269, 0.973862];
+pub(super) const PRONATION: [f64; 3] = [0.056398, 0.998406, 0.001952];
 
 /// Everything but the root's position.
 fn pose_of(row: &Row, knee_sign: f64) -> Pose {

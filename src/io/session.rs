@@ -6,6 +6,7 @@
 
 use super::calib_toml::{self, CalibError};
 use super::images::{self, ImageError};
+use super::session_config;
 use super::video::{self, Video, VideoError, VideoFacts};
 use crate::footage::{self, FrameSet};
 use crate::math::order::quantile;
@@ -61,7 +62,7 @@ pub enum SessionError {
     Size { path: PathBuf, camera: String, found: String, expected: String },
     #[error("{}: only {present} have an empty-stage picture, {absent} has none; give every camera one (NAME_background.png) or none", folder.display())]
     SomeBackgrounds { folder: PathBuf, present: String, absent: String },
-    #[error("{}: {message}; the only key is fps, frames per second", path.display())]
+    #[error("{}: {message}", path.display())]
     Config { path: PathBuf, message: String },
     #[error("a frame rate of {fps} 1/s is impossible; give a number above 0, such as 30")]
     Fps { fps: f64 },
@@ -77,14 +78,6 @@ pub enum SessionError {
     VideoAccess { index: usize },
     #[error("there is no frame {index}, the session has {count}")]
     NoFrame { index: usize, count: usize },
-}
-
-/// Options in `muybridge.toml`, in the session or in the study folder above it; the nearer file wins.
-#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SessionConfig {
-    /// Frames per second of pictures, which do not say it themselves.
-    pub fps: Option<f64>,
 }
 
 /// Where the frames of one camera are.
@@ -133,7 +126,7 @@ impl Session {
             let (count, fps) = open_videos(folder, &rig, &sources, &mut notices)?;
             (sources.into_iter().map(Source::Video).collect(), (0..count).collect(), fps)
         };
-        let fps = choose_fps(fps_override, video_fps, read_config(folder)?.fps, &mut notices)?;
+        let fps = choose_fps(fps_override, video_fps, session_config::read(folder)?.fps, &mut notices)?;
         let backgrounds = read_backgrounds(folder, &entries, &rig)?;
         let frame_count = frame_numbers.len();
         Ok((Session { folder: folder.into(), rig, cameras, backgrounds, fps, frame_numbers, frame_count }, notices))
@@ -422,23 +415,6 @@ fn choose_fps(given: Option<f64>, video: Option<f64>, config: Option<f64>, notic
     let overruled = if given.is_some() { video } else { video.and(config) };
     notices.extend(overruled.filter(|o| (o - fps).abs() > 0.01 * fps).map(|o| format!("taking {fps} frames/s, not {o}")));
     Ok(fps)
-}
-
-/// The options of the session, else those of the folder above it.
-fn read_config(folder: &Path) -> Result<SessionConfig, SessionError> {
-    let mut config = SessionConfig::default();
-    let absolute = std::path::absolute(folder).map_err(|error| SessionError::Read { path: folder.into(), error })?;
-    for place in absolute.ancestors().take(2) {
-        let path = place.join("muybridge.toml");
-        if !path.is_file() {
-            continue;
-        }
-        let text = std::fs::read_to_string(&path).map_err(|error| SessionError::Read { path: path.clone(), error })?;
-        let found: SessionConfig =
-            toml::from_str(&text).map_err(|e| SessionError::Config { path, message: calib_toml::toml_message(&text, &e) })?;
-        config = SessionConfig { fps: config.fps.or(found.fps) };
-    }
-    Ok(config)
 }
 
 fn read_backgrounds(folder: &Path, entries: &[PathBuf], rig: &Rig) -> Result<Option<Vec<GrayImage>>, SessionError> {

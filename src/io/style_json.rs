@@ -37,7 +37,7 @@ pub fn write_style(path: &Path, style: &Style) -> Result<(), StyleFileError> {
 mod tests {
     use super::*;
     use crate::motion_model::Activity;
-    use crate::style::Neighbour;
+    use crate::style::{Neighbour, Observation};
 
     #[test]
     fn comes_back_as_written_and_refuses_other_files() {
@@ -51,6 +51,8 @@ mod tests {
             cadence_factor: 1.02,
             neighbours: vec![Neighbour { subject: "12".into(), distance: 0.3, mahalanobis: 1.2, own_spread: 0.2, inside: false }],
             shape: None,
+            detail: None,
+            also: vec![Observation { parameter: 1.4, weights: vec![0.2, 0.1], covariance: None, cadence_factor: 1.01, detail: None }],
         };
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("style.json");

@@ -4,6 +4,7 @@ pub mod arrow;
 pub mod banded;
 pub mod curves;
 pub mod distance_field;
+pub mod euler;
 pub mod order;
 pub mod pca;
 pub mod rbf;

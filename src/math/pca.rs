@@ -29,20 +29,19 @@ pub fn pca(examples: &DMatrix<f64>) -> Pca {
     let mean = examples.column_mean();
     let mut centred = examples.clone();
     centred.column_iter_mut().for_each(|mut column| column -= &mean);
-    let eigen = (centred.tr_mul(&centred) / m as f64).symmetric_eigen();
+    // A product with a transposed copy runs in blocks, `tr_mul` does not.
+    let eigen = (centred.transpose() * &centred / m as f64).symmetric_eigen();
     let mut order: Vec<usize> = (0..m).collect();
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
     order.truncate((m - 1).min(d));
     let eigenvalues: Vec<f64> = order.iter().map(|&i| eigen.eigenvalues[i].max(0.0)).collect();
     let kept = eigenvalues.iter().take_while(|&&l| l > NULL_SPACE * eigenvalues[0]).count();
-    let columns: Vec<DVector<f64>> =
-        order[..kept].iter().map(|&i| with_sign((&centred * eigen.eigenvectors.column(i)).normalize())).collect();
-    let basis = if columns.is_empty() { DMatrix::zeros(d, 0) } else { DMatrix::from_columns(&columns) };
+    let mut basis = &centred * eigen.eigenvectors.select_columns(&order[..kept]);
+    for mut component in basis.column_iter_mut() {
+        let sign = if component[component.iamax()] < 0.0 { -1.0 } else { 1.0 };
+        component *= sign / component.norm();
+    }
     Pca { mean, basis, eigenvalues }
-}
-
-fn with_sign(component: DVector<f64>) -> DVector<f64> {
-    if component[component.iamax()] < 0.0 { -component } else { component }
 }
 
 /// Number of leading components that hold `part` (0 to 1) of the variance, equation (3) of the style paper.

@@ -34,7 +34,13 @@ pub struct Rbf {
 impl Rbf {
     /// `None` where two nodes lie in one point, or none is given.
     pub fn new(nodes: Vec<Vec<f64>>) -> Option<Rbf> {
-        let factor = kernel_matrix(&nodes).cholesky()?;
+        Rbf::smoothing(nodes, 0.0)
+    }
+
+    /// With H + `ridge` I in place of H: nodes are smoothed over, not reproduced, and may lie in one point.
+    pub fn smoothing(nodes: Vec<Vec<f64>>, ridge: f64) -> Option<Rbf> {
+        let h = kernel_matrix(&nodes) + DMatrix::identity(nodes.len(), nodes.len()) * ridge;
+        let factor = h.cholesky()?;
         // A pivot below this is rounding.
         let smallest = factor.l().diagonal().iter().copied().fold(f64::INFINITY, f64::min);
         (smallest.is_finite() && smallest > 1e-7).then_some(Rbf { nodes, factor })
@@ -86,6 +92,13 @@ mod tests {
         let row = DVector::from_iterator(4, nodes().iter().map(|n| kernel(squared_distance(n, &p))));
         let theirs = pseudo.transpose() * row;
         assert!(rbf.weights(&p).iter().zip(theirs.iter()).all(|(a, b)| (a - b).abs() < 1e-10));
+    }
+
+    #[test]
+    fn two_nodes_in_one_point_share_what_a_ridge_leaves() {
+        let rbf = Rbf::smoothing(vec![vec![1.0], vec![1.0]], 0.5).unwrap();
+        // (1 + 1/2) w + w = 1 for each.
+        assert!(rbf.weights(&[1.0]).iter().all(|w| (w - 1.0 / 2.5).abs() < 1e-12));
     }
 
     #[test]

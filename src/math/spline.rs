@@ -31,6 +31,11 @@ impl Spline {
         (self.x[0], self.x[self.x.len() - 1])
     }
 
+    /// All knots, smallest first.
+    pub fn knots(&self) -> &[f64] {
+        &self.x
+    }
+
     pub fn at(&self, x: f64) -> DVector<f64> {
         let last = self.x.len() - 1;
         if last == 0 {

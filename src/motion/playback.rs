@@ -13,8 +13,8 @@ use nalgebra::{DVector, UnitQuaternion, Vector3};
 
 use crate::body::{BALL_JOINTS, Clip, NODES, Pose};
 use crate::math::rotation::exp;
-use crate::motion_model::{Cycle, Model, RootSample};
-use crate::style::{Metric, Population, Style, StyleError, extrapolate};
+use crate::motion_model::{Cycle, Detail, Model, RootSample};
+use crate::style::{Extrapolation, Method, Population, Style, StyleError};
 
 /// A jump's progress is only stretched by factors in this range: beyond, the weights describe another kind of jump.
 const STRETCH: std::ops::RangeInclusive<f64> = 0.4..=2.5;
@@ -23,13 +23,17 @@ const STRETCH: std::ops::RangeInclusive<f64> = 0.4..=2.5;
 #[derive(Clone, Debug)]
 pub struct Synthesis {
     pub weights: DVector<f64>,
+    /// What of a recorded motion the weights do not hold.
+    pub detail: Option<Detail>,
+    /// Standard deviation of every weight; the paper's scheme has none.
+    pub sd: Option<Vec<f64>>,
     /// Wanted speed in m/s or jump length in m.
     pub parameter: f64,
     /// Hip height of the body that is to move.
     pub hip_height_m: f64,
     /// Cycles (jumps) per second.
     pub frequency_hz: f64,
-    /// Database subjects and their weights in equation (8).
+    /// Database subjects and their weights of equation (7).
     pub shares: Vec<(String, f64)>,
     pub notice: Option<String>,
 }
@@ -42,19 +46,30 @@ pub enum Length {
     Seconds(f64),
 }
 
+impl Length {
+    /// Duration for cycles that repeat `frequency_hz` times a second.
+    pub fn seconds(self, frequency_hz: f64) -> f64 {
+        match self {
+            Length::Cycles(n) => n as f64 / frequency_hz,
+            Length::Seconds(s) => s,
+        }
+    }
+}
+
 /// Weights and cadence of `style` at `parameter` for a body with `hip_height_m`; `population` comes from the same model.
 pub fn synthesize(
     model: &Model,
     population: &Population,
-    metric: Metric,
+    method: Method,
     style: &Style,
     parameter: f64,
     hip_height_m: f64,
 ) -> Result<Synthesis, StyleError> {
     let at_own_size = parameter * style.hip_height_m / hip_height_m;
-    let found = extrapolate(population, metric, &style.weights, style.parameter, at_own_size)?;
-    let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(parameter, hip_height_m);
-    Ok(Synthesis { weights: found.weights, parameter, hip_height_m, frequency_hz, shares: found.shares, notice: found.notice })
+    let found = style.at(population, method, at_own_size)?;
+    let frequency_hz = style.cadence_factor_at(at_own_size) * model.cadence().frequency_hz(parameter, hip_height_m);
+    let Extrapolation { weights, detail, sd, shares, notice } = found;
+    Ok(Synthesis { weights, detail, sd, parameter, hip_height_m, frequency_hz, shares, notice })
 }
 
 /// Plays at `fps` from the start of a cycle; `offsets` are those of the body that moves.
@@ -67,7 +82,7 @@ pub fn play(model: &Model, synthesis: &Synthesis, offsets: &[Vector3<f64>; NODES
         frequency_hz: synthesis.frequency_hz,
         stretch: if cyclic { 1.0 } else { stretch(model, synthesis) },
     };
-    ride.clip(&|phase| model.posture(synthesis.weights.as_slice(), phase), offsets, fps, length)
+    ride.clip(&|phase| model.posture_with(synthesis.weights.as_slice(), synthesis.detail.as_ref(), phase), offsets, fps, length)
 }
 
 /// Plays a recorded cycle as it is, over and over where it is a gait's.
@@ -96,9 +111,8 @@ type Posture<'a> = &'a dyn Fn(f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootS
 impl Ride {
     fn clip(&self, posture: Posture, offsets: &[Vector3<f64>; NODES], fps: f64, length: Length) -> Clip {
         let seconds = match length {
-            Length::Cycles(n) if self.cyclic => n as f64 / self.frequency_hz,
-            Length::Seconds(s) => s,
-            Length::Cycles(_) => 1.0 / self.frequency_hz,
+            Length::Cycles(_) if !self.cyclic => 1.0 / self.frequency_hz,
+            _ => length.seconds(self.frequency_hz),
         };
         let frames = (seconds * fps).round() as usize + 1;
         let poses = (0..frames)
@@ -121,7 +135,7 @@ fn root_position(root: &RootSample, hip_height_m: f64, travelled_m: f64, stretch
 
 /// Factor that makes a jump end at the wanted length.
 fn stretch(model: &Model, synthesis: &Synthesis) -> f64 {
-    let (_, end) = model.posture(synthesis.weights.as_slice(), 1.0);
+    let (_, end) = model.posture_with(synthesis.weights.as_slice(), synthesis.detail.as_ref(), 1.0);
     let factor = synthesis.parameter / (end.position.z * synthesis.hip_height_m);
     if STRETCH.contains(&factor) { factor } else { 1.0 }
 }
@@ -149,7 +163,7 @@ mod tests {
         let style = style(&model);
         let population = Population::new(&model, style.weights.len());
         for (speed, hip_height_m) in [(0.9, style.hip_height_m), (1.37, style.hip_height_m), (1.2, 0.7)] {
-            let s = synthesize(&model, &population, Metric::Paper, &style, speed, hip_height_m).unwrap();
+            let s = synthesize(&model, &population, Method::Default, &style, speed, hip_height_m).unwrap();
             let clip = play(&model, &s, &Shape::template(hip_height_m / 0.53).offsets(), 100.0, Length::Cycles(5));
             let seconds = (clip.poses.len() - 1) as f64 / clip.fps;
             let way = clip.poses[clip.poses.len() - 1].root - clip.poses[0].root;
@@ -170,7 +184,7 @@ mod tests {
         let style = style(&model);
         let own = synthetic::subject(Activity::Walking, 7).mean_cycle(1.2);
         let population = Population::new(&model, style.weights.len());
-        let s = synthesize(&model, &population, Metric::Paper, &style, 1.2, style.hip_height_m).unwrap();
+        let s = synthesize(&model, &population, Method::Default, &style, 1.2, style.hip_height_m).unwrap();
         assert!((s.frequency_hz * own.duration_s - 1.0).abs() < 1e-9);
         assert!((style.cadence_factor - 1.0).abs() > 1e-3, "the subject's own factor is to be seen");
     }
@@ -181,7 +195,7 @@ mod tests {
         let member = model.members[5].clone();
         let style = Style::of_cycles(&model, "", &[model.cycle_of(&member)]).unwrap();
         let population = Population::new(&model, style.weights.len());
-        let s = synthesize(&model, &population, Metric::Paper, &style, member.parameter, member.hip_height_m).unwrap();
+        let s = synthesize(&model, &population, Method::Default, &style, member.parameter, member.hip_height_m).unwrap();
         let clip = play(&model, &s, &Shape::template(1.7).offsets(), 100.0, Length::Seconds(0.5));
         assert_eq!(clip.poses.len(), 51);
         let expected = model.cycle(model.member_weights(&member).as_slice(), "", member.parameter, member.hip_height_m, member.duration_s);
@@ -201,6 +215,8 @@ mod tests {
         let weights = model.project(&model.vector_of(&cycle));
         let synthesis = Synthesis {
             weights,
+            detail: None,
+            sd: None,
             parameter: 1.3,
             hip_height_m: cycle.hip_height_m,
             frequency_hz: 1.0 / cycle.duration_s,

@@ -7,7 +7,7 @@
 //! Departure: the paper does not say how rotations become numbers; vectors about the mean stay far from the wrap at π.
 //! Checked against exact reconstruction with all components, the normal equations of (6), and numpy on the stored vectors.
 
-use nalgebra::{DMatrix, DVector, DVectorView, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, DVector, Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
 use super::cadence::CadenceLaw;
@@ -32,6 +32,26 @@ pub struct Member {
     pub vector: DVector<f64>,
     /// Root channels, length SAMPLES·ROOT_CHANNELS, index `sample·6 + channel`: rotation x y z, position x y z.
     pub root: DVector<f64>,
+}
+
+/// What of a cycle the weights of a model do not hold, as vectors of [`Member::vector`] and [`Member::root`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Detail {
+    pub vector: DVector<f64>,
+    pub root: DVector<f64>,
+}
+
+impl Detail {
+    /// Weighted sum; `None` of nothing.
+    pub fn sum<'a>(parts: impl Iterator<Item = (&'a Detail, f64)>) -> Option<Detail> {
+        parts.fold(None, |sum: Option<Detail>, (part, weight)| {
+            let mut sum =
+                sum.unwrap_or_else(|| Detail { vector: DVector::zeros(part.vector.len()), root: DVector::zeros(part.root.len()) });
+            sum.vector.axpy(weight, &part.vector, 1.0);
+            sum.root.axpy(weight, &part.root, 1.0);
+            Some(sum)
+        })
+    }
 }
 
 /// Mean, principal components and members of one activity's database.
@@ -65,6 +85,8 @@ pub enum ModelError {
     Activity { origin: String, found: Activity, wanted: Activity },
     #[error("all cycles of the database are equal, there is nothing to model")]
     NoVariance,
+    #[error("the model holds {origin} already; leave it out")]
+    Twice { origin: String },
 }
 
 impl Model {
@@ -101,6 +123,18 @@ impl Model {
         let root_basis = root_loadings(&roots, &root_mean, &weights);
         let Pca { mean, eigenvalues, .. } = found;
         Ok(Model { activity, synthetic, mean_rotations, mean, basis, eigenvalues, root_mean, root_basis, members })
+    }
+
+    /// The model of these cycles too, as if built of all: the members' own cycles are kept in it, no recording is read again.
+    pub fn with(&self, cycles: &[Cycle]) -> Result<Model, ModelError> {
+        let old = self.members.iter().map(|m| self.cycle_of(m));
+        for cycle in cycles {
+            let same = |m: &Member| m.subject == cycle.subject && m.source == cycle.source && m.parameter == cycle.parameter;
+            if self.members.iter().any(same) {
+                return Err(ModelError::Twice { origin: format!("{} ({})", cycle.source, cycle.subject) });
+            }
+        }
+        Model::build(self.activity, self.synthetic, &old.chain(cycles.iter().cloned()).collect::<Vec<_>>())
     }
 
     /// Number of components that hold `variance` (0 to 1) of the database, at most those stored, at least one.
@@ -154,30 +188,30 @@ impl Model {
     /// Joint rotations (index `joint as usize - 1`) and root at `phase`, interpolated linearly between the neighbouring
     /// samples; a gait's phase wraps, a jump's is held at its ends.
     pub fn posture(&self, weights: &[f64], phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
-        let (before, after, part) = neighbours(self.activity, phase);
-        let at = |sample: usize| {
-            let joints = combine_rows(&self.mean, &self.basis, weights, sample * DOF, DOF);
-            (joints, combine_rows(&self.root_mean, &self.root_basis, weights, sample * ROOT_CHANNELS, ROOT_CHANNELS))
-        };
-        let ((joints0, root0), (joints1, root1)) = (at(before), at(after));
-        let joints = joints0.lerp(&joints1, part);
-        let root = root0.lerp(&root1, part);
-        (rotations(&self.mean_rotations, joints.as_view()), root_sample(root.as_view()))
+        self.posture_with(weights, None, phase)
+    }
+
+    /// [`Model::posture`] with what the weights do not hold.
+    pub fn posture_with(&self, weights: &[f64], detail: Option<&Detail>, phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
+        let between = neighbours(self.activity, phase);
+        let (mut joints, mut root) = ([0.0; DOF], [0.0; ROOT_CHANNELS]);
+        blend(&mut joints, between, &self.mean, &self.basis, weights, detail.map(|d| &d.vector));
+        blend(&mut root, between, &self.root_mean, &self.root_basis, weights, detail.map(|d| &d.root));
+        (rotations(&self.mean_rotations, &joints), root_sample(&root))
     }
 
     /// The whole cycle of weights; subject, parameter and size as given.
     pub fn cycle(&self, weights: &[f64], subject: &str, parameter: f64, hip_height_m: f64, duration_s: f64) -> Cycle {
         let (vector, root) = (self.vector(weights), self.root(weights));
-        Cycle {
+        self.cycle_of(&Member {
             subject: subject.to_string(),
             source: "synthesized".to_string(),
-            activity: self.activity,
             parameter,
             hip_height_m,
             duration_s,
-            joints: (0..SAMPLES).map(|k| rotations(&self.mean_rotations, vector.rows(k * DOF, DOF))).collect(),
-            root: (0..SAMPLES).map(|k| root_sample(root.rows(k * ROOT_CHANNELS, ROOT_CHANNELS))).collect(),
-        }
+            vector,
+            root,
+        })
     }
 
     /// A cycle as a member: its vector is relative to this model's mean rotations.
@@ -194,8 +228,8 @@ impl Model {
             parameter: member.parameter,
             hip_height_m: member.hip_height_m,
             duration_s: member.duration_s,
-            joints: (0..SAMPLES).map(|k| rotations(&self.mean_rotations, member.vector.rows(k * DOF, DOF))).collect(),
-            root: (0..SAMPLES).map(|k| root_sample(member.root.rows(k * ROOT_CHANNELS, ROOT_CHANNELS))).collect(),
+            joints: member.vector.as_slice().chunks_exact(DOF).map(|row| rotations(&self.mean_rotations, row)).collect(),
+            root: member.root.as_slice().chunks_exact(ROOT_CHANNELS).map(root_sample).collect(),
         }
     }
 
@@ -282,22 +316,67 @@ fn root_loadings(roots: &DMatrix<f64>, root_mean: &DVector<f64>, weights: &DMatr
 }
 
 fn combine(mean: &DVector<f64>, basis: &DMatrix<f64>, weights: &[f64]) -> DVector<f64> {
-    combine_rows(mean, basis, weights, 0, mean.len())
-}
-
-fn combine_rows(mean: &DVector<f64>, basis: &DMatrix<f64>, weights: &[f64], first: usize, count: usize) -> DVector<f64> {
-    let mut sum = mean.rows(first, count).into_owned();
+    let mut sum = mean.clone();
     for (i, w) in weights.iter().take(basis.ncols()).enumerate() {
-        sum.axpy(*w, &basis.column(i).rows(first, count), 1.0);
+        sum.axpy(*w, &basis.column(i), 1.0);
     }
     sum
 }
 
-fn rotations(means: &[UnitQuaternion<f64>; BALL_JOINTS], coordinates: DVectorView<f64>) -> [UnitQuaternion<f64>; BALL_JOINTS] {
-    std::array::from_fn(|j| means[j] * exp(&Vector3::new(coordinates[3 * j], coordinates[3 * j + 1], coordinates[3 * j + 2])))
+/// Row `before` of mean + basis weights + detail towards row `after` by `part`; a row is as long as `out`.
+fn blend(
+    out: &mut [f64],
+    (before, after, part): (usize, usize, f64),
+    mean: &DVector<f64>,
+    basis: &DMatrix<f64>,
+    weights: &[f64],
+    detail: Option<&DVector<f64>>,
+) {
+    let (width, length) = (out.len(), mean.len());
+    let columns = weights.iter().copied().zip(basis.as_slice().chunks_exact(length));
+    let fixed = [Some(mean), detail].into_iter().flatten().map(|v| (1.0, v.as_slice()));
+    for (weight, column) in fixed.chain(columns) {
+        let (a, b) = (&column[before * width..][..width], &column[after * width..][..width]);
+        let (of_a, of_b) = (weight * (1.0 - part), weight * part);
+        for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
+            *out += of_a * a + of_b * b;
+        }
+    }
 }
 
-fn root_sample(c: DVectorView<f64>) -> RootSample {
+fn rotations(means: &[UnitQuaternion<f64>; BALL_JOINTS], coordinates: &[f64]) -> [UnitQuaternion<f64>; BALL_JOINTS] {
+    std::array::from_fn(|j| means[j] * turn(coordinates[3 * j], coordinates[3 * j + 1], coordinates[3 * j + 2]))
+}
+
+/// Terms of the series below: at half a turn the next one is 1e-17.
+const TERMS: usize = 11;
+/// 1/(2k)! and 1/(2k+1)! with alternating signs.
+const SERIES: ([f64; TERMS], [f64; TERMS]) = {
+    let (mut even, mut odd) = ([1.0; TERMS], [1.0; TERMS]);
+    let mut k = 1;
+    while k < TERMS {
+        let n = 2.0 * k as f64;
+        even[k] = -odd[k - 1] / n;
+        odd[k] = even[k] / (n + 1.0);
+        k += 1;
+    }
+    (even, odd)
+};
+
+/// exp of a rotation vector by the series of cos and sin(h)/h, h half the angle: neither roots nor branches, which is what a
+/// million postures a second need. Beyond half a turn, where the series fades, the closed form.
+fn turn(x: f64, y: f64, z: f64) -> UnitQuaternion<f64> {
+    let square = x * x + y * y + z * z;
+    if square > 9.8 {
+        return exp(&Vector3::new(x, y, z));
+    }
+    let h2 = 0.25 * square;
+    let sum = |series: &[f64; TERMS]| series.iter().rev().fold(0.0, |sum, c| sum * h2 + c);
+    let (cos, sinc) = (sum(&SERIES.0), 0.5 * sum(&SERIES.1));
+    UnitQuaternion::new_unchecked(Quaternion::new(cos, sinc * x, sinc * y, sinc * z))
+}
+
+fn root_sample(c: &[f64]) -> RootSample {
     RootSample { rotation: Vector3::new(c[0], c[1], c[2]), position: Vector3::new(c[3], c[4], c[5]) }
 }
 
@@ -379,6 +458,35 @@ mod tests {
         let jump = Model { activity: Activity::Jumping, ..model };
         assert_eq!(jump.posture(alpha.as_slice(), 1.7), jump.posture(alpha.as_slice(), 1.0));
         assert!(jump.posture(alpha.as_slice(), 1.0).0[2].angle_to(&cycle.joints[99][2]) < 1e-9);
+    }
+
+    #[test]
+    fn series_turns_as_the_closed_form_does() {
+        for k in 0..2000 {
+            let t = f64::from(k);
+            let v = Vector3::new((1.1 * t).sin(), (0.7 * t).cos(), (0.3 * t).sin()) * (0.0017 * t);
+            let (found, wanted) = (turn(v.x, v.y, v.z), exp(&v));
+            assert!((found.coords - wanted.coords).amax() < 1e-14 && (found.coords.norm() - 1.0).abs() < 1e-14, "{}", v.norm());
+        }
+    }
+
+    #[test]
+    fn a_model_with_a_new_subject_is_the_model_of_all() {
+        let all = cycles();
+        let (first, new): (Vec<Cycle>, Vec<Cycle>) = all.iter().cloned().partition(|c| c.subject != all[8].subject);
+        assert_eq!((first.len(), new.len()), (6, 3));
+        let updated = Model::build(Activity::Walking, true, &first).unwrap().with(&new).unwrap();
+        let whole = Model::build(Activity::Walking, true, &all).unwrap();
+        assert!((&updated.mean - &whole.mean).norm() < 1e-9 && updated.basis.ncols() == whole.basis.ncols());
+        for (a, b) in updated.eigenvalues.iter().zip(&whole.eigenvalues) {
+            assert!((a - b).abs() < 1e-9 * whole.eigenvalues[0]);
+        }
+        assert!((&updated.basis - &whole.basis).norm() < 1e-5, "{}", (&updated.basis - &whole.basis).norm());
+        assert!((&updated.root_basis - &whole.root_basis).norm() < 1e-5);
+        assert_eq!(updated.members[7].source, whole.members[7].source);
+        let without = Model::build(Activity::Walking, true, &first).unwrap();
+        assert!((&without.mean - &whole.mean).norm() > 0.1);
+        assert!(matches!(whole.with(&new[..1]), Err(ModelError::Twice { .. })));
     }
 
     #[test]

@@ -3,7 +3,8 @@
 //! Gait. Heel strikes are the maxima of the heel's position ahead of the root along the local heading (Zeni et al. 2008,
 //! Gait & Posture 27(4)), which needs no floor and works on a treadmill, whose belt is added to the root's path first.
 //! A cycle runs from one right strike to the next; a clip that holds more strides between left strikes gives these, rotated
-//! so that phase 0 is the right strike within. The cycle's carrier follows the circular arc through the root's first and last
+//! so that phase 0 is the right strike within; a clip with no stride between strikes is cut where the feet are farthest behind.
+//! The cycle's carrier follows the circular arc through the root's first and last
 //! position whose turn Δψ is the change of the root's yaw between two equal phases:
 //!   heading ψ(μ) = ψ0 + Δψ μ,   ψ0 = direction of the chord − Δψ/2,   arc length L = chord · (Δψ/2)/sin(Δψ/2)     (1)
 //! so a turning walk has the path speed L/T, and what is left of the root is periodic. The small difference that remains
@@ -236,19 +237,24 @@ struct Stride {
     right_strike: f64,
 }
 
-/// The strides between right strikes, or where the clip holds more of them those between left strikes.
+/// The strides between right strikes, or where the clip holds more of them those between left strikes; without any of these
+/// the strides from one farthest place behind to the next, which short recordings of a single stride need.
 fn strides(track: &Track) -> Result<Vec<Stride>, SegmentError> {
-    let [right, left] = [0, 1].map(|side| strikes(track, side));
-    let of_right = right.windows(2).map(|w| Stride { from: w[0], to: w[1], right_strike: 0.0 });
-    let of_left = left.windows(2).filter_map(|w| {
-        let strike = right.iter().find(|&&r| r > w[0] && r < w[1])?;
-        Some(Stride { from: w[0], to: w[1], right_strike: (strike - w[0]) / (w[1] - w[0]) })
-    });
-    let (of_right, of_left): (Vec<Stride>, Vec<Stride>) = (of_right.collect(), of_left.collect());
-    match of_right.len().max(of_left.len()) {
-        0 => Err(SegmentError::NoStride { strikes: right.len() }),
-        most => Ok(if of_right.len() == most { of_right } else { of_left }),
-    }
+    let ahead = [0, 1].map(|side| ahead(track, &track.heels[side]));
+    let behind = ahead.each_ref().map(|a| maxima(&a.iter().map(|x| -x).collect::<Vec<_>>()));
+    let [right, left] = ahead.map(|a| maxima(&a));
+    let of_right: Vec<Stride> = right.windows(2).map(|w| Stride { from: w[0], to: w[1], right_strike: 0.0 }).collect();
+    let around = |events: &[f64]| -> Vec<Stride> {
+        let stride = |w: &[f64]| {
+            let strike = right.iter().find(|&&r| r > w[0] && r < w[1])?;
+            Some(Stride { from: w[0], to: w[1], right_strike: (strike - w[0]) / (w[1] - w[0]) })
+        };
+        events.windows(2).filter_map(stride).collect()
+    };
+    let most = |a: Vec<Stride>, b: Vec<Stride>| if b.len() > a.len() { b } else { a };
+    let found = most(of_right, around(&left));
+    let found = if found.is_empty() { most(around(&behind[0]), around(&behind[1])) } else { found };
+    if found.is_empty() { Err(SegmentError::NoStride { strikes: right.len() }) } else { Ok(found) }
 }
 
 /// Median speed of the root over half seconds, m/s.
@@ -262,26 +268,27 @@ fn travel_speed(track: &Track) -> f64 {
 
 /// Heel strikes of the right (0) or left (1) foot in frames, with fractions.
 pub(super) fn strikes(track: &Track, side: usize) -> Vec<f64> {
-    maxima(&smooth(&ahead(track, &track.heels[side]), SMOOTH_S * track.fps))
+    maxima(&ahead(track, &track.heels[side]))
 }
 
 /// Frames, with fractions, at which a point of the foot is farthest behind the root (Zeni's toe-off, of a toe's tip).
 pub(super) fn farthest_behind(track: &Track, points: &[Vector3<f64>]) -> Vec<f64> {
     let behind: Vec<f64> = ahead(track, points).iter().map(|x| -x).collect();
-    maxima(&smooth(&behind, SMOOTH_S * track.fps))
+    maxima(&behind)
 }
 
-/// How far a point is ahead of the root along the heading of the second around, metres.
+/// How far a point is ahead of the root along the heading of the second around, smoothed, metres.
 fn ahead(track: &Track, points: &[Vector3<f64>]) -> Vec<f64> {
     let facings: Vec<Vector2<f64>> = track.poses.iter().map(facing).collect();
     let half = track.frames(0.5);
-    (0..facings.len())
+    let ahead: Vec<f64> = (0..facings.len())
         .map(|i| {
             let heading: Vector2<f64> = facings[i.saturating_sub(half)..(i + half + 1).min(facings.len())].iter().sum();
             let heading = heading.try_normalize(1e-9).unwrap_or(facings[i]);
             heading.dot(&ground(&(points[i] - track.poses[i].root)))
         })
-        .collect()
+        .collect();
+    smooth(&ahead, SMOOTH_S * track.fps)
 }
 
 /// Gaussian average with `sigma` in samples; the ends average what there is.
@@ -624,6 +631,25 @@ mod tests {
         clip.poses = clip.poses[45..215].to_vec();
         let found = segment(&clip, &label(None)).unwrap();
         assert_eq!(found.cycles.len(), 1);
+        for (k, joints) in found.cycles[0].joints.iter().enumerate() {
+            let hip = log(&joints[Joint::RHip as usize - 1]).x;
+            assert!((hip + 0.4 * (TAU * k as f64 / SAMPLES as f64).cos()).abs() < 0.01, "{k}");
+        }
+    }
+
+    #[test]
+    fn one_stride_without_two_equal_strikes_is_cut_where_the_foot_is_farthest_behind() {
+        let mut clip = walker(1.3, 0.0, false);
+        for (i, pose) in clip.poses.iter_mut().enumerate() {
+            // A limp: the left strikes come at phase 0.35, not 0.5.
+            let phase = (i as f64 / FPS - STRIKE_S) / PERIOD_S - 0.35;
+            pose.joints[Joint::LHip as usize - 1] = exp(&Vector3::new(-0.4 * (TAU * phase).cos(), 0.0, 0.0));
+        }
+        // Phases 0.42 to 1.72: strikes at 1.0 and 1.35, but the right foot is behind at 0.5 and 1.5.
+        clip.poses = clip.poses[78..226].to_vec();
+        let found = segment(&clip, &label(None)).unwrap();
+        assert_eq!(found.cycles.len(), 1);
+        assert!((found.cycles[0].duration_s - PERIOD_S).abs() < 0.006);
         for (k, joints) in found.cycles[0].joints.iter().enumerate() {
             let hip = log(&joints[Joint::RHip as usize - 1]).x;
             assert!((hip + 0.4 * (TAU * k as f64 / SAMPLES as f64).cos()).abs() < 0.01, "{k}");

@@ -6,6 +6,7 @@ use opencv::core::{Mat, Point, Scalar, Vec3b, Vector};
 use opencv::imgproc::{self, FONT_HERSHEY_SIMPLEX, LINE_AA};
 
 use super::ReportError;
+use super::marks::Mark;
 use crate::body::{Joint, NODES};
 
 pub type Colour = [u8; 3];
@@ -191,38 +192,50 @@ impl Pen {
 
 /// Draws a skeleton whose node k is at pixel `nodes[k]`; bones of nodes that are `None` are left out.
 pub fn skeleton(canvas: &mut Canvas, nodes: &[Option<[f64; 2]>; NODES], pen: &Pen) -> Result<(), ReportError> {
+    skeleton_marks(nodes, pen).iter().try_for_each(|mark| mark.draw(canvas))
+}
+
+/// The same as marks.
+pub fn skeleton_marks(nodes: &[Option<[f64; 2]>; NODES], pen: &Pen) -> Vec<Mark> {
     let bones: Vec<_> =
         Joint::ALL.into_iter().filter_map(|joint| Some((joint, nodes[joint.parent()? as usize]?, nodes[joint as usize]?))).collect();
+    let line = |from, to, colour, width_px| Mark::Line { from, to, colour, width_px };
+    let mut marks = Vec::new();
     if let Some(rim) = pen.rim {
-        for (_, from, to) in &bones {
-            canvas.line(*from, *to, rim, pen.width_px + 4)?;
-        }
+        marks.extend(bones.iter().map(|(_, from, to)| line(*from, *to, rim, pen.width_px + 4)));
     }
-    for (joint, from, to) in &bones {
-        canvas.line(*from, *to, pen.colour(*joint), pen.width_px)?;
-    }
+    marks.extend(bones.iter().map(|(joint, from, to)| line(*from, *to, pen.colour(*joint), pen.width_px)));
     let radius = 0.9 * f64::from(pen.width_px);
     for (joint, _, to) in &bones {
         if let Some(rim) = pen.rim {
-            canvas.disc(*to, radius + 2.0, rim)?;
+            marks.push(Mark::Disc { centre: *to, radius_px: radius + 2.0, colour: rim });
         }
-        canvas.disc(*to, radius, pen.colour(*joint))?;
+        marks.push(Mark::Disc { centre: *to, radius_px: radius, colour: pen.colour(*joint) });
     }
-    head(canvas, nodes, pen)
+    marks.extend(head(nodes, pen));
+    marks
+}
+
+/// Which colour is which side, at the top of a picture of figures, from column `x` on.
+pub fn legend(canvas: &mut Canvas, x: f64) -> Result<(), ReportError> {
+    for (x, name, colour) in [(x, "left", LEFT), (x + 110.0, "right", RIGHT)] {
+        canvas.line([x, 22.0], [x + 28.0, 22.0], colour, 4)?;
+        canvas.text([x + 36.0, 27.0], name, 10.0, INK, Align::Left)?;
+    }
+    Ok(())
 }
 
 /// A circle where the head is: the skull base is its lower back, a neck's length above the base of the neck.
-fn head(canvas: &mut Canvas, nodes: &[Option<[f64; 2]>; NODES], pen: &Pen) -> Result<(), ReportError> {
+fn head(nodes: &[Option<[f64; 2]>; NODES], pen: &Pen) -> Vec<Mark> {
     let (Some(neck), Some(skull), Some(root)) = (nodes[Joint::Vt1 as usize], nodes[Joint::Skullbase as usize], nodes[0]) else {
-        return Ok(());
+        return Vec::new();
     };
     let centre = [0, 1].map(|k| skull[k] + 0.55 * (skull[k] - neck[k]));
     // Root to base of the neck is 0.30 of stature, half a head's height 0.055.
-    let radius = 0.055 / 0.30 * (neck[0] - root[0]).hypot(neck[1] - root[1]);
-    if let Some(rim) = pen.rim {
-        canvas.circle(centre, radius, rim, pen.width_px + 4)?;
-    }
-    canvas.circle(centre, radius, faded(pen.middle, pen.fade), pen.width_px)
+    let radius_px = 0.055 / 0.30 * (neck[0] - root[0]).hypot(neck[1] - root[1]);
+    let circle = |colour, width_px| Mark::Circle { centre, radius_px, colour, width_px };
+    let rim = pen.rim.map(|rim| circle(rim, pen.width_px + 4));
+    rim.into_iter().chain([circle(faded(pen.middle, pen.fade), pen.width_px)]).collect()
 }
 
 /// Round numbers that divide [low, high] into about `count` parts: 1, 2 or 5 times a power of ten apart.

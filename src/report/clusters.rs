@@ -14,36 +14,15 @@ const ELLIPSE: f64 = 2.448;
 /// The first two weights of every cycle, a colour and a name per subject, and `weights` with its 95 % ellipse where
 /// `covariance` (2x2) is known; in units of the population's standard deviation.
 pub fn clusters(model: &Model, weights: &[f64], covariance: Option<[[f64; 2]; 2]>, title: &str) -> Result<RgbImage, ReportError> {
+    let series = series(model);
     let scale = |i: usize| model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12));
-    let units = |w: &[f64]| [0, 1].map(|i| w.get(i).copied().unwrap_or(0.0) / scale(i));
-    let subjects = model.subjects();
-    let mut series: Vec<Curve> = Vec::new();
-    for (k, subject) in subjects.iter().enumerate() {
-        let points = model.members.iter().filter(|m| m.subject == *subject).map(|m| units(model.project(&m.vector).as_slice()));
-        series.push(Curve { label: subject.to_string(), points: points.collect(), dashed: false, colour: k, band: Vec::new() });
-    }
-    let person = units(weights);
+    let person = units(model, weights);
     let ring = covariance.map(|c| ellipse(person, [[0, 0], [0, 1], [1, 1]].map(|[i, j]| c[i][j] / scale(i) / scale(j))));
     let found =
         Curve { label: String::new(), points: ring.clone().unwrap_or_else(|| vec![person]), dashed: false, colour: 0, band: Vec::new() };
     let all: Vec<Curve> = series.iter().cloned().chain([found]).collect();
     let frame = Frame::around(&all, 1000.0, 720.0);
-    let mut canvas = Canvas::new(1000, 720, WHITE);
-    canvas.text([84.0, 32.0], title, 14.0, INK, Align::Left)?;
-    canvas.text([24.0, 96.0], "second weight (standard deviations of the database)", 11.0, INK, Align::Left)?;
-    canvas.text([530.0, 706.0], "first weight (standard deviations of the database)", 11.0, INK, Align::Centre)?;
-    frame.axes(&mut canvas)?;
-    for curve in &series {
-        let colour = faded(PALETTE[curve.colour % PALETTE.len()], 0.3);
-        for p in &curve.points {
-            canvas.disc(frame.pixel(*p), 4.0, colour)?;
-        }
-    }
-    for curve in series.iter().filter(|c| !c.points.is_empty()) {
-        let n = curve.points.len() as f64;
-        let [x, y] = frame.pixel([0, 1].map(|k| curve.points.iter().map(|p| p[k]).sum::<f64>() / n));
-        canvas.text([x, y - 7.0], &curve.label, 9.0, INK, Align::Centre)?;
-    }
+    let mut canvas = subjects(&frame, &series, title)?;
     if let Some(ring) = ring {
         let pixels: Vec<_> = ring.iter().map(|p| frame.pixel(*p)).collect();
         canvas.polyline(&pixels, INK, 2, false)?;
@@ -54,6 +33,45 @@ pub fn clusters(model: &Model, weights: &[f64], covariance: Option<[[f64; 2]; 2]
     }
     canvas.text([x + 14.0, y + 5.0], "this person", 11.0, INK, Align::Left)?;
     Ok(canvas.picture)
+}
+
+/// [`clusters`] of the database alone (Figures 1 and 2).
+pub fn database_clusters(model: &Model, title: &str) -> Result<RgbImage, ReportError> {
+    let series = series(model);
+    Ok(subjects(&Frame::around(&series, 1000.0, 720.0), &series, title)?.picture)
+}
+
+/// First two weights over their standard deviations.
+fn units(model: &Model, weights: &[f64]) -> [f64; 2] {
+    [0, 1].map(|i| weights.get(i).copied().unwrap_or(0.0) / model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12)))
+}
+
+fn series(model: &Model) -> Vec<Curve> {
+    let one = |(k, subject): (usize, &str)| {
+        let points = model.members.iter().filter(|m| m.subject == subject).map(|m| units(model, model.project(&m.vector).as_slice()));
+        Curve { label: subject.to_string(), points: points.collect(), dashed: false, colour: k, band: Vec::new() }
+    };
+    model.subjects().into_iter().enumerate().map(one).collect()
+}
+
+fn subjects(frame: &Frame, series: &[Curve], title: &str) -> Result<Canvas, ReportError> {
+    let mut canvas = Canvas::new(1000, 720, WHITE);
+    canvas.text([84.0, 32.0], title, 14.0, INK, Align::Left)?;
+    canvas.text([24.0, 96.0], "second weight (standard deviations of the database)", 11.0, INK, Align::Left)?;
+    canvas.text([530.0, 706.0], "first weight (standard deviations of the database)", 11.0, INK, Align::Centre)?;
+    frame.axes(&mut canvas)?;
+    for curve in series {
+        let colour = faded(PALETTE[curve.colour % PALETTE.len()], 0.3);
+        for p in &curve.points {
+            canvas.disc(frame.pixel(*p), 4.0, colour)?;
+        }
+    }
+    for curve in series.iter().filter(|c| !c.points.is_empty()) {
+        let n = curve.points.len() as f64;
+        let [x, y] = frame.pixel([0, 1].map(|k| curve.points.iter().map(|p| p[k]).sum::<f64>() / n));
+        canvas.text([x, y - 7.0], &curve.label, 9.0, INK, Align::Centre)?;
+    }
+    Ok(canvas)
 }
 
 /// The 95 % ellipse of covariance [xx, xy, yy] about a point.

@@ -103,18 +103,25 @@ impl Frame {
     }
 
     pub fn axes(&self, canvas: &mut Canvas) -> Result<(), ReportError> {
+        let bottom = self.height - BOTTOM;
+        self.heights(canvas)?;
+        let marks = ticks(self.x.0, self.x.1, 8);
+        for mark in &marks {
+            let x = self.pixel([*mark, self.y.0])[0];
+            canvas.line([x, bottom], [x, bottom + 6.0], INK, 1)?;
+            canvas.text([x, bottom + 24.0], &tick_label(*mark, &marks), 10.0, INK, Align::Centre)?;
+        }
+        Ok(())
+    }
+
+    /// The axis of y alone, with the line below it.
+    pub fn heights(&self, canvas: &mut Canvas) -> Result<(), ReportError> {
         let (right, bottom) = (self.width - RIGHT, self.height - BOTTOM);
         let marks = ticks(self.y.0, self.y.1, 6);
         for mark in &marks {
             let y = self.pixel([self.x.0, *mark])[1];
             canvas.line([LEFT, y], [right, y], GRID, 1)?;
             canvas.text([LEFT - 10.0, y + 5.0], &tick_label(*mark, &marks), 10.0, INK, Align::Right)?;
-        }
-        let marks = ticks(self.x.0, self.x.1, 8);
-        for mark in &marks {
-            let x = self.pixel([*mark, self.y.0])[0];
-            canvas.line([x, bottom], [x, bottom + 6.0], INK, 1)?;
-            canvas.text([x, bottom + 24.0], &tick_label(*mark, &marks), 10.0, INK, Align::Centre)?;
         }
         canvas.line([LEFT, bottom], [right, bottom], INK, 1)
     }

@@ -6,7 +6,7 @@ use image::RgbImage;
 use nalgebra::Vector3;
 
 use super::ReportError;
-use super::canvas::{Align, Canvas, GRID, INK, LEFT, Pen, RIGHT, WHITE, skeleton, tick_label, ticks};
+use super::canvas::{Align, Canvas, GRID, INK, Pen, WHITE, legend, skeleton, tick_label, ticks};
 use crate::body::{Clip, NODES, place};
 
 const PX_PER_M: f64 = 200.0;
@@ -20,21 +20,20 @@ pub fn stick_figures(clips: &[(String, &Clip)], figures: usize) -> Result<RgbIma
     let tall = rows.iter().map(|r| r.top_m).fold(1.0, f64::max);
     let row_px = (tall * PX_PER_M) as u32 + 62;
     let mut canvas = Canvas::new(LABEL_PX + (reach * PX_PER_M) as u32 + 30, row_px * rows.len() as u32 + 44, WHITE);
-    legend(&mut canvas)?;
+    legend(&mut canvas, f64::from(LABEL_PX))?;
     for (i, row) in rows.iter().enumerate() {
         row.draw(&mut canvas, f64::from(44 + (i as u32 + 1) * row_px) - 34.0, reach)?;
     }
     Ok(canvas.picture)
 }
 
-fn legend(canvas: &mut Canvas) -> Result<(), ReportError> {
-    let mut x = f64::from(LABEL_PX);
-    for (name, colour) in [("left", LEFT), ("right", RIGHT)] {
-        canvas.line([x, 22.0], [x + 28.0, 22.0], colour, 4)?;
-        canvas.text([x + 36.0, 27.0], name, 10.0, INK, Align::Left)?;
-        x += 110.0;
-    }
-    Ok(())
+/// Where a clip goes, or looks if it stays in place; horizontal.
+pub(super) fn forward(clip: &Clip) -> Vector3<f64> {
+    let (Some(first), Some(last)) = (clip.poses.first(), clip.poses.last()) else { return Vector3::z() };
+    let flat = |v: Vector3<f64>| Vector3::new(v.x, 0.0, v.z);
+    let travel = flat(last.root - first.root);
+    let forward = if travel.norm() > 0.3 { travel } else { flat(first.world_from_root * Vector3::z()) };
+    forward.try_normalize(1e-9).unwrap_or_else(Vector3::z)
 }
 
 /// Node positions as (forward, height) in metres from the clip's first root position.
@@ -49,11 +48,8 @@ struct Row<'a> {
 impl Row<'_> {
     fn new<'a>(label: &'a str, clip: &Clip, figures: usize) -> Row<'a> {
         let mut row = Row { label, figures: Vec::new(), from_m: 0.0, to_m: 0.0, top_m: 0.0 };
-        let (Some(first), Some(last)) = (clip.poses.first(), clip.poses.last()) else { return row };
-        let flat = |v: Vector3<f64>| Vector3::new(v.x, 0.0, v.z);
-        let travel = flat(last.root - first.root);
-        let forward = if travel.norm() > 0.3 { travel } else { flat(first.world_from_root * Vector3::z()) };
-        let forward = forward.try_normalize(1e-9).unwrap_or_else(Vector3::z);
+        let Some(first) = clip.poses.first() else { return row };
+        let forward = forward(clip);
         let count = figures.clamp(1, clip.poses.len());
         for i in 0..count {
             let pose = &clip.poses[i * (clip.poses.len() - 1) / (count - 1).max(1)];

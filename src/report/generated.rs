@@ -10,8 +10,8 @@ use super::style_charts::{against_parameter, clusters};
 use super::{ReportError, stick_figures};
 use crate::body::Clip;
 use crate::motion::Synthesis;
-use crate::motion_model::{Activity, Model};
 use crate::motion_model::gait::{Gait, Measure, PERCENTS, cycle_angles, gait};
+use crate::motion_model::{Activity, Model};
 use crate::style::Style;
 
 /// Figures of one row of the chronophotograph, over this time.

@@ -22,10 +22,13 @@ pub mod curves;
 pub mod figures;
 pub mod generated;
 pub mod maps;
+pub mod marks;
+pub mod model;
 pub mod overlay;
 pub mod page;
 pub mod person;
 pub mod rig;
+pub mod strips;
 pub mod study;
 pub mod style_charts;
 pub mod track;
@@ -36,7 +39,7 @@ pub mod walk;
 
 pub use calibration::calibration;
 pub use clouds::{CloudDot, cloud_and_body};
-pub use clusters::clusters;
+pub use clusters::{clusters, database_clusters};
 pub use curves::{Curve, curves};
 pub use figures::stick_figures;
 pub use maps::{depth_map, person_depth};
@@ -59,6 +62,11 @@ pub enum ReportError {
 pub fn save(path: &Path, picture: &RgbImage) -> Result<(), ReportError> {
     let png = png_bytes(path, &DynamicImage::from(picture.clone()))?;
     write_atomic(path, &png).map_err(|error| ReportError::Write { path: path.into(), error })
+}
+
+/// Writes a drawing as SVG.
+pub fn save_drawing(path: &Path, drawing: &marks::Drawing) -> Result<(), ReportError> {
+    write_atomic(path, drawing.svg().as_bytes()).map_err(|error| ReportError::Write { path: path.into(), error })
 }
 
 /// The PNG file that `path` is to be.

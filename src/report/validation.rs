@@ -8,9 +8,10 @@ use crate::motion_model::Model;
 use crate::style::validate::{Score, Validation};
 
 /// What every method and metric is, for readers of the page.
-const METHODS: [(&str, &str); 7] = [
+const METHODS: [(&str, &str); 8] = [
     ("default", "the style carried to the other speed or length as `generate` does it"),
     ("paper", "the style paper's equation (8)"),
+    ("several", "the default from all the person's other speeds or lengths at once"),
     ("mean", "the population's mean at the target"),
     ("unchanged", "the person's own motion, unchanged"),
     ("mean-change", "the own motion plus the population's mean change"),
@@ -43,7 +44,7 @@ impl ValidationReport<'_> {
     /// The whole page.
     pub fn html(&self) -> String {
         let scores = &self.validation.scores;
-        let metrics = names(scores, |s| s.metric);
+        let metrics = names(scores, |s| &s.metric);
         let charts: Vec<Markup> = metrics.iter().map(|metric| self.chart(metric)).collect();
         let sections = [
             Section::new("Errors", html! { (self.means(&metrics)) (gallery(&charts)) (methods(scores)) }),
@@ -161,7 +162,7 @@ impl ValidationReport<'_> {
                 ("cases", format!("{}, in {} of them too few other subjects were recorded at both ends", v.cases, v.sparse_cases)),
                 ("version", concat!("muybridge ", env!("CARGO_PKG_VERSION")).to_string()),
             ]))
-            p.small.soft { "Numbers beside this page: validation.csv." }
+            p.small.soft { "Numbers beside this page: validation.csv, of every angle degrees.csv." }
         }
     }
 }

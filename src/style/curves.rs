@@ -11,6 +11,7 @@ use nalgebra::DVector;
 
 use super::Neighbour;
 use super::distance::Metric;
+use super::transfer::Lasting;
 use crate::math::spline::Spline;
 use crate::motion_model::{Member, Model};
 
@@ -61,6 +62,22 @@ impl Curve {
     pub fn at(&self, parameter: f64) -> DVector<f64> {
         self.spline.at(parameter)
     }
+
+    /// First and last parameter of the recordings.
+    pub fn range(&self) -> (f64, f64) {
+        self.spline.range()
+    }
+
+    /// Parameters of the recordings, smallest first.
+    pub fn parameters(&self) -> &[f64] {
+        self.spline.knots()
+    }
+
+    /// Change of the weights per unit of the parameter over the own recordings; `None` with one parameter only.
+    pub fn slope(&self) -> Option<DVector<f64>> {
+        let points: Vec<(f64, f64, DVector<f64>)> = self.parameters().iter().map(|&s| (1.0, s, self.at(s))).collect();
+        (points.len() > 1).then(|| slope(&points, points[0].2.len()))
+    }
 }
 
 /// All subjects of a database, as far as `count` components show them.
@@ -71,6 +88,8 @@ pub struct Population {
     pub eigenvalues: Vec<f64>,
     /// Change of the weights per unit of the parameter over the whole database.
     pub slope: DVector<f64>,
+    /// How a person's deviation from the others lasts.
+    pub lasting: Lasting,
 }
 
 impl Population {
@@ -90,7 +109,22 @@ impl Population {
                 curves.push(Curve { subject: subject.to_string(), spline });
             }
         }
-        Population { curves, eigenvalues: model.eigenvalues[..count].to_vec(), slope: slope(&points, count) }
+        let (eigenvalues, slope) = (model.eigenvalues[..count].to_vec(), slope(&points, count));
+        let mut population = Population { curves, eigenvalues, slope, lasting: Lasting::default() };
+        population.lasting = Lasting::of(&population);
+        population
+    }
+
+    /// Smallest and largest parameter of the recordings.
+    pub fn range(&self) -> (f64, f64) {
+        let ends = self.curves.iter().map(|c| c.spline.range());
+        ends.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), (first, last)| (lo.min(first), hi.max(last)))
+    }
+
+    /// How far outside everybody's recordings `parameter` lies, 0 inside and just beyond.
+    pub fn beyond(&self, parameter: f64) -> f64 {
+        let (lo, hi) = self.range();
+        (lo - JUST_BEYOND - parameter).max(parameter - hi - JUST_BEYOND).max(0.0)
     }
 
     /// Number of components in use.
@@ -142,6 +176,11 @@ impl Population {
 /// Mean motion vector of a knot's cycles.
 pub fn mean_vector(knot: &Knot) -> DVector<f64> {
     knot.members.iter().map(|m| &m.vector).sum::<DVector<f64>>() / knot.members.len() as f64
+}
+
+/// Mean root channels of a knot's cycles.
+pub fn mean_root(knot: &Knot) -> DVector<f64> {
+    knot.members.iter().map(|m| &m.root).sum::<DVector<f64>>() / knot.members.len() as f64
 }
 
 /// Least-squares slope of weighted points (share, parameter, weights); zero where the parameter does not vary.

@@ -5,9 +5,11 @@
 //! do (sparse databases, or an s2 that nobody moved at), every subject takes part with its curve extended by the
 //! population's change, and a notice says so.
 //! Fails when: the person is far from everybody; then the weights are nearly equal and the style fades into the mean.
+//! That is the paper's scheme; the default, which keeps the own motion, is `transfer`.
 
 use nalgebra::DVector;
 
+use super::Detail;
 use super::curves::{Curve, Population};
 use super::distance::{Metric, inverse_distance_weights};
 
@@ -19,6 +21,10 @@ const ENOUGH: usize = 2;
 pub struct Extrapolation {
     /// α̃, as many as the population has components.
     pub weights: DVector<f64>,
+    /// What of a recorded motion the weights do not hold, at the new parameter.
+    pub detail: Option<Detail>,
+    /// Standard deviation of every weight; the paper's scheme has none.
+    pub sd: Option<Vec<f64>>,
     /// Database subjects and their weights w_p.
     pub shares: Vec<(String, f64)>,
     /// What the reader of the result should know.
@@ -43,9 +49,10 @@ pub fn extrapolate(population: &Population, metric: Metric, weights: &[f64], s1:
         return Err(StyleError::NotFinite);
     }
     let observed = DVector::from_column_slice(&weights[..wanted]);
-    let both: Vec<&Curve> = population.curves.iter().filter(|c| c.takes_part(s1) && c.takes_part(s2)).collect();
-    let sparse = both.len() < ENOUGH;
-    let subjects: Vec<&Curve> = if sparse { population.curves.iter().collect() } else { both };
+    let all: Vec<&Curve> = population.curves.iter().collect();
+    let both = shared_subjects(&all, [s1, s2]);
+    let sparse = both.is_none();
+    let subjects = both.unwrap_or(all);
     let notice = sparse.then(|| {
         format!(
             "fewer than {ENOUGH} database subjects were recorded both at {s1:.2} and at {s2:.2}: all {} take part, carried \
@@ -61,7 +68,14 @@ pub fn extrapolate(population: &Population, metric: Metric, weights: &[f64], s1:
         sum.axpy(*share, &population.extended(curve, s2), 1.0);
     }
     let shares = subjects.iter().map(|c| c.subject.clone()).zip(shares).collect();
-    Ok(Extrapolation { weights: sum, shares, notice })
+    Ok(Extrapolation { weights: sum, detail: None, sd: None, shares, notice })
+}
+
+/// Those of `subjects` that take part at every one of `parameters`, where they are enough.
+pub(super) fn shared_subjects<'a>(subjects: &[&'a Curve], parameters: impl IntoIterator<Item = f64> + Clone) -> Option<Vec<&'a Curve>> {
+    let everywhere = |c: &Curve| parameters.clone().into_iter().all(|s| c.takes_part(s));
+    let shared: Vec<&Curve> = subjects.iter().copied().filter(|c| everywhere(c)).collect();
+    (shared.len() >= ENOUGH).then_some(shared)
 }
 
 #[cfg(test)]

@@ -1,22 +1,36 @@
 //! A person's style: weights in a motion model at one parameter, and the same person's weights at another.
 //!
 //! Style paper §4, equations 4 to 8. `distance` holds (6) and (7), `curves` the database subjects over the parameter,
-//! `extrapolate` (8), `validate` the cross-validation of §5.2.
+//! `extrapolate` (8), `transfer` the default that keeps the own motion, `validate` the cross-validation of §5.2.
 
+pub mod angles;
 pub mod curves;
 pub mod distance;
 pub mod extrapolate;
+pub mod space;
+pub mod transfer;
 pub mod validate;
 
 pub use curves::Population;
 pub use distance::Metric;
 pub use extrapolate::{Extrapolation, StyleError, extrapolate};
+pub use transfer::transfer;
 
 use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
 
 use crate::body::Shape;
-use crate::motion_model::{Activity, Cycle, Model};
+use crate::motion_model::{Activity, Cycle, Detail, Member, Model};
+use curves::{Knot, knots, mean_root, mean_vector};
+
+/// How the weights at another parameter are found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Method {
+    /// The own motion kept, see [`transfer`].
+    Default,
+    /// Equations (6) to (8), or with another distance in place of (6).
+    Paper(Metric),
+}
 
 /// A database subject and the distance to it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -54,9 +68,99 @@ pub struct Style {
     pub neighbours: Vec<Neighbour>,
     /// Body size where the observation gave one.
     pub shape: Option<Shape>,
+    /// What of a recorded motion the weights do not hold; files do not keep it.
+    #[serde(skip)]
+    pub detail: Option<Detail>,
+    /// The same person at other parameters.
+    #[serde(default)]
+    pub also: Vec<Observation>,
+}
+
+/// One person's motion at one parameter.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Observation {
+    /// Speed in m/s, for jumps the length in m.
+    pub parameter: f64,
+    pub weights: Vec<f64>,
+    pub covariance: Option<Vec<Vec<f64>>>,
+    pub cadence_factor: f64,
+    #[serde(skip)]
+    pub detail: Option<Detail>,
+}
+
+impl Observation {
+    /// The mean of recorded cycles of one person.
+    pub fn of_knot(model: &Model, knot: &Knot) -> Observation {
+        let mean = |f: fn(&Member) -> f64| knot.members.iter().map(|m| f(m)).sum::<f64>() / knot.members.len() as f64;
+        let (vector, root) = (mean_vector(knot), mean_root(knot));
+        let weights = model.project(&vector);
+        let detail = Detail { vector: vector - model.vector(weights.as_slice()), root: root - model.root(weights.as_slice()) };
+        let law_hz = model.cadence().frequency_hz(knot.parameter, mean(|m| m.hip_height_m));
+        Observation {
+            parameter: knot.parameter,
+            weights: weights.as_slice().to_vec(),
+            covariance: None,
+            cadence_factor: 1.0 / (mean(|m| m.duration_s) * law_hz),
+            detail: Some(detail),
+        }
+    }
+
+    /// Whether it holds `wanted` finite weights.
+    fn check(&self, wanted: usize) -> Result<(), StyleError> {
+        let found = self.weights.len();
+        if found < wanted {
+            return Err(StyleError::Weights { found, wanted });
+        }
+        let finite = self.parameter.is_finite() && self.weights.iter().all(|w| w.is_finite());
+        if finite { Ok(()) } else { Err(StyleError::NotFinite) }
+    }
+
+    /// Variance of weight `i`, 0 where the observation gave none.
+    fn variance(&self, i: usize) -> f64 {
+        let entry = self.covariance.as_ref().and_then(|c| c.get(i)?.get(i).copied());
+        entry.filter(|v| v.is_finite() && *v > 0.0).unwrap_or(0.0)
+    }
 }
 
 impl Style {
+    /// Weights of this person at `parameter` (m/s or m); `population` comes from the model of the style.
+    pub fn at(&self, population: &Population, method: Method, parameter: f64) -> Result<Extrapolation, StyleError> {
+        match method {
+            Method::Default => transfer(population, &self.observations(), parameter),
+            Method::Paper(metric) => extrapolate(population, metric, &self.weights, self.parameter, parameter),
+        }
+    }
+
+    /// With what was seen of the same person at other times; the first observation stays the main one.
+    pub fn and(mut self, other: Style) -> Style {
+        self.also.extend(other.observations());
+        self
+    }
+
+    /// All that was seen of the person.
+    pub fn observations(&self) -> Vec<Observation> {
+        let first = Observation {
+            parameter: self.parameter,
+            weights: self.weights.clone(),
+            covariance: self.covariance.clone(),
+            cadence_factor: self.cadence_factor,
+            detail: self.detail.clone(),
+        };
+        [first].into_iter().chain(self.also.iter().cloned()).collect()
+    }
+
+    /// Cycle frequency over the model's law, as observed nearest to `parameter`.
+    pub fn cadence_factor_at(&self, parameter: f64) -> f64 {
+        let mut nearest = (self.parameter, self.cadence_factor);
+        for seen in &self.also {
+            if (seen.parameter - parameter).abs() < (nearest.0 - parameter).abs() {
+                nearest = (seen.parameter, seen.cadence_factor);
+            }
+        }
+        nearest.1
+    }
+
     /// From weights that were observed at `parameter` with cycles of `frequency_hz`.
     pub fn of_weights(
         model: &Model,
@@ -78,16 +182,24 @@ impl Style {
             cadence_factor: frequency_hz / model.cadence().frequency_hz(parameter, hip_height_m),
             neighbours,
             shape: None,
+            detail: None,
+            also: Vec::new(),
         }
     }
 
-    /// The mean of one person's recorded cycles; `None` without cycles.
+    /// One person's recorded cycles: the mean at the parameter with the most of them, the means at the others beside it;
+    /// `None` without cycles.
     pub fn of_cycles(model: &Model, model_hash: &str, cycles: &[Cycle]) -> Option<Style> {
+        let members: Vec<Member> = cycles.iter().map(|c| model.member_of(c)).collect();
+        let knots = knots(&members);
+        let main = (0..knots.len()).max_by_key(|&k| (knots[k].members.len(), std::cmp::Reverse(k)))?;
+        let mut also: Vec<Observation> = knots.iter().map(|k| Observation::of_knot(model, k)).collect();
+        let first = also.remove(main);
+        let weights = DVector::from_vec(first.weights);
         let n = cycles.len() as f64;
-        let mean = |f: fn(&Cycle) -> f64| cycles.iter().map(f).sum::<f64>() / n;
-        let first = cycles.first()?;
-        let weights = cycles.iter().map(|c| model.project(&model.vector_of(c))).sum::<DVector<f64>>() / n;
-        let frequency_hz = 1.0 / mean(|c| c.duration_s);
-        Some(Style::of_weights(model, model_hash, &weights, mean(|c| c.parameter), first.hip_height_m, frequency_hz))
+        let hip_height_m = cycles.iter().map(|c| c.hip_height_m).sum::<f64>() / n;
+        let frequency_hz = first.cadence_factor * model.cadence().frequency_hz(first.parameter, hip_height_m);
+        let style = Style::of_weights(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
+        Some(Style { detail: first.detail, also, ..style })
     }
 }

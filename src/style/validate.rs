@@ -1,198 +1,352 @@
-//! Leave-one-subject-out validation (style paper §5.2).
+//! Leave-one-subject-out validation (style paper §5.2, Figure 8).
 //!
-//! For every subject the model is built anew without it. Its motions at s1 are projected and carried to s2, for all ordered
-//! pairs of its parameters, and compared with the projection of what was recorded there. Baselines: the population's mean at
-//! s2 (`mean`), the own motion unchanged (`unchanged`), the own motion plus the population's mean change (`mean-change`).
-//! `intra` compares cycles of the subject at one parameter, `inter` its cycles with everybody else's at any.
-//! `rms_deg` is the rotation angle between synthesized and recorded joint rotations, pooled over cases, samples and the
-//! joints that move in the recordings, against the recorded mean cycle itself.
+//! For every subject the model is built anew without it. Its mean motions at s1 are carried to s2, for all ordered pairs of its
+//! parameters, and compared with what was recorded there. Methods: `default` ([`transfer`]), `paper` (equations 6 to 8 over the
+//! components that hold `variance`), `several` (the default from all its other parameters at once); baselines: the population's
+//! mean at s2 (`mean`), the own motion (`unchanged`), the own motion plus the population's mean change (`mean-change`). `intra`
+//! compares cycles of the subject at one parameter, `inter` its cycles with everybody else's: at any parameter in weights, mean
+//! cycles at one parameter in degrees and mm.
+//!
+//! Metrics: distances of weights, `eq6` and `mahalanobis`, over the components that hold `variance`; `rms_deg`, the root mean
+//! square over cases, samples and the angles that the recordings hold ([`Angles`]); `rms_mm`, the root mean square distance of
+//! [`JOINTS`] on the template body with the subject's hip height, pelvis on pelvis. The last two are against the mean of the
+//! recorded cycles, not its projection; methods that keep the own motion keep what the weights do not hold of it.
 
-use nalgebra::{DVector, Vector3};
+use nalgebra::{DVector, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 
-use super::curves::{JUST_BEYOND, Knot, Population, knots, mean_vector};
+use super::angles::{Angles, wrapped};
+use super::curves::{JUST_BEYOND, Knot, Population, knots, mean_root, mean_vector};
 use super::distance::Metric;
 use super::extrapolate::extrapolate;
-use crate::body::{BALL_JOINTS, DOF};
-use crate::math::rotation::{exp, log};
-use crate::motion_model::{Cycle, Member, Model, ModelError, SAMPLES};
+use super::transfer::transfer;
+use super::{Observation, StyleError};
+use crate::body::{BALL_JOINTS, Joint, NODES, Pose, Shape, place};
+use crate::motion_model::{Cycle, Detail, Member, Model, ModelError};
 
-/// A joint whose coordinates vary less than this over the subject's recordings is held still by the capture, radians.
-const STILL_RAD: f64 = 0.003;
+/// Whose positions `rms_mm` compares.
+pub const JOINTS: [Joint; 14] = [
+    Joint::LHip,
+    Joint::LKnee,
+    Joint::LAnkle,
+    Joint::LMidtarsal,
+    Joint::RHip,
+    Joint::RKnee,
+    Joint::RAnkle,
+    Joint::RMidtarsal,
+    Joint::LShoulder,
+    Joint::LElbow,
+    Joint::LWrist,
+    Joint::RShoulder,
+    Joint::RElbow,
+    Joint::RWrist,
+];
+
+/// Hip height of the template as a part of stature.
+const HIP_OF_STATURE: f64 = 0.53;
+
+/// In the order of [`METHODS`].
+#[derive(Clone, Copy)]
+enum Row {
+    Default,
+    Paper,
+    Several,
+    Mean,
+    Unchanged,
+    MeanChange,
+    Intra,
+    Inter,
+}
+
+const METHODS: [&str; 8] = ["default", "paper", "several", "mean", "unchanged", "mean-change", "intra", "inter"];
+pub const METRICS: [&str; 4] = ["eq6", "mahalanobis", "rms_deg", "rms_mm"];
 
 /// One line of `validation.csv`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Score {
     pub method: &'static str,
-    pub metric: &'static str,
+    /// One of [`METRICS`], in [`Validation::angles`] the name of an angle.
+    pub metric: String,
     /// A subject or `all`.
     pub left_out: String,
     pub value: f64,
 }
 
-/// Scores, and how many of the cases needed the population's change because too few subjects were recorded at both ends.
+/// What the validation found.
 #[derive(Clone, Debug)]
 pub struct Validation {
     pub scores: Vec<Score>,
+    /// Degrees of every angle.
+    pub angles: Vec<Score>,
     pub cases: usize,
+    /// Cases in which too few other subjects were recorded at both ends.
     pub sparse_cases: usize,
+    /// Root mean square of the default's errors over their predicted standard deviations; 1 is exact.
+    pub sd_ratio: f64,
 }
 
-const METHODS: [&str; 6] = ["paper", "mean", "unchanged", "mean-change", "intra", "inter"];
-const METRICS: [&str; 3] = ["eq6", "mahalanobis", "rms_deg"];
+/// A sum and how many it has.
+type Sum = (f64, f64);
 
-/// Sums of one left-out subject: per method and metric the sum and the count (squares for `rms_deg`).
+/// Sums of one method.
 #[derive(Clone, Default)]
 struct Sums {
-    sums: [[(f64, f64); METRICS.len()]; METHODS.len()],
+    distances: [Sum; 2],
+    /// Squares per angle.
+    angles: Vec<Sum>,
+    /// Squared distances, m².
+    positions: Sum,
+}
+
+/// Sums of one left-out subject.
+struct LeftOut {
+    methods: Vec<Sums>,
     cases: usize,
     sparse_cases: usize,
+    /// Squared error over variance, of the default's weights.
+    spread: Sum,
 }
 
-impl Sums {
-    fn add(&mut self, method: usize, eigenvalues: &[f64], a: &DVector<f64>, b: &DVector<f64>) {
-        for (m, metric) in [Metric::Paper, Metric::Mahalanobis].into_iter().enumerate() {
-            self.sums[method][m].0 += metric.distance(eigenvalues, a, b);
-            self.sums[method][m].1 += 1.0;
-        }
-    }
+/// Weights and what they do not hold.
+type Motion = (DVector<f64>, Option<Detail>);
 
-    fn add_angles(&mut self, method: usize, squares: (f64, f64)) {
-        let sum = &mut self.sums[method][2];
-        *sum = (sum.0 + squares.0, sum.1 + squares.1);
-    }
+/// A motion in the three forms that are compared.
+struct Shown {
+    weights: DVector<f64>,
+    angles: DVector<f64>,
+    positions: Vec<Vector3<f64>>,
 }
 
-/// Scores of every subject and of all (means over subjects; angles pooled). `variance` chooses the components of every
-/// rebuilt model.
+/// Scores of every subject and of all (distances: means over subjects; degrees and mm pooled). `variance` chooses the components
+/// of the distances and of `paper` in every rebuilt model.
 pub fn validate(model: &Model, variance: f64) -> Result<Validation, ModelError> {
-    let subjects: Vec<String> = model.subjects().into_iter().map(String::from).collect();
-    let sums: Vec<Sums> = subjects.iter().map(|s| leave_out(model, s, variance)).collect::<Result<_, _>>()?;
-    let mut scores = Vec::new();
-    for (i, method) in METHODS.into_iter().enumerate() {
-        for (j, metric) in METRICS.into_iter().enumerate() {
-            let value = |(sum, count): (f64, f64)| if metric == "rms_deg" { (sum / count).sqrt().to_degrees() } else { sum / count };
-            let found: Vec<(&String, (f64, f64))> =
-                subjects.iter().zip(&sums).map(|(s, r)| (s, r.sums[i][j])).filter(|f| f.1.1 > 0.0).collect();
-            if found.is_empty() {
-                continue;
-            }
-            let mut push = |left_out: &str, value| scores.push(Score { method, metric, left_out: left_out.to_string(), value });
-            found.iter().for_each(|(subject, sum)| push(subject, value(*sum)));
-            let pooled = found.iter().fold((0.0, 0.0), |all, (_, s)| (all.0 + s.0, all.1 + s.1));
-            let mean = found.iter().map(|(_, s)| value(*s)).sum::<f64>() / found.len() as f64;
-            push("all", if metric == "rms_deg" { value(pooled) } else { mean });
+    let subjects: Vec<&str> = model.subjects();
+    let angles = Angles::of_recordings(model);
+    let found: Vec<LeftOut> = subjects.par_iter().map(|s| leave_out(model, &angles, s, variance)).collect::<Result<_, _>>()?;
+    let (mut scores, mut by_angle) = (Vec::new(), Vec::new());
+    for (row, method) in METHODS.into_iter().enumerate() {
+        let one: Vec<&Sums> = found.iter().map(|f| &f.methods[row]).collect();
+        for (m, metric) in METRICS.into_iter().enumerate() {
+            let sums: Vec<Sum> = one.iter().map(|s| metric_sum(s, m)).collect();
+            table(&mut scores, method, metric, &subjects, &sums, (m > 1).then_some(if m == 2 { 1f64.to_degrees() } else { 1e3 }));
+        }
+        for (i, name) in angles.names().into_iter().enumerate() {
+            let sums: Vec<Sum> = one.iter().map(|s| s.angles[i]).collect();
+            table(&mut by_angle, method, name, &subjects, &sums, Some(1f64.to_degrees()));
         }
     }
-    let total = |f: fn(&Sums) -> usize| sums.iter().map(f).sum();
-    Ok(Validation { scores, cases: total(|s| s.cases), sparse_cases: total(|s| s.sparse_cases) })
-}
-
-fn leave_out(model: &Model, subject: &str, variance: f64) -> Result<Sums, ModelError> {
-    let cycles =
-        |own: bool| -> Vec<Cycle> { model.members.iter().filter(|m| (m.subject == subject) == own).map(|m| model.cycle_of(m)).collect() };
-    let others = Model::build(model.activity, model.synthetic, &cycles(false))?;
-    let others = others.truncated(others.components(variance));
-    let own: Vec<Member> = cycles(true).iter().map(|c| others.member_of(c)).collect();
-    let mut sums = Sums::default();
-    let own_knots = knots(&own);
-    interpolation(&others, &own_knots, &mut sums);
-    variability(&others, &own, &own_knots, &mut sums);
-    Ok(sums)
-}
-
-/// Methods 0 to 3 over all ordered pairs of the subject's parameters.
-fn interpolation(others: &Model, own: &[Knot], sums: &mut Sums) {
-    let population = Population::new(others, others.basis.ncols());
-    let moving = moving_joints(own);
-    let recorded: Vec<DVector<f64>> = own.iter().map(mean_vector).collect();
-    for (i, from) in own.iter().enumerate() {
-        for (k, to) in own.iter().enumerate().filter(|(k, _)| *k != i) {
-            let observed = others.project(&recorded[i]);
-            let target = others.project(&recorded[k]);
-            let change = mean_change(&population, from.parameter, to.parameter);
-            let Ok(paper) = extrapolate(&population, Metric::Paper, observed.as_slice(), from.parameter, to.parameter) else {
-                continue;
-            };
-            sums.cases += 1;
-            sums.sparse_cases += usize::from(paper.notice.is_some());
-            let mean = population_mean(&population, to.parameter);
-            for (method, weights) in [paper.weights, mean, observed.clone(), observed + change].into_iter().enumerate() {
-                sums.add(method, &population.eigenvalues, &weights, &target);
-                sums.add_angles(method, angle_squares(others, &moving, &others.vector(weights.as_slice()), &recorded[k]));
-            }
-        }
-    }
-}
-
-/// Methods 4 and 5. Angles of `inter` are taken between mean cycles at parameters not farther apart than a subject takes part.
-fn variability(others: &Model, own: &[Member], own_knots: &[Knot], sums: &mut Sums) {
-    let l = &others.eigenvalues;
-    let moving = moving_joints(own_knots);
-    for knot in own_knots {
-        for (i, a) in knot.members.iter().enumerate() {
-            for b in &knot.members[..i] {
-                sums.add(4, l, &others.project(&a.vector), &others.project(&b.vector));
-                sums.add_angles(4, angle_squares(others, &moving, &a.vector, &b.vector));
-            }
-        }
-    }
-    let rest: Vec<DVector<f64>> = others.members.iter().map(|m| others.member_weights(m)).collect();
-    for a in own {
-        let a = others.project(&a.vector);
-        rest.iter().for_each(|b| sums.add(5, l, &a, b));
-    }
-    for subject in others.subjects() {
-        for b in knots(others.members.iter().filter(|m| m.subject == subject)) {
-            for a in own_knots.iter().filter(|a| (a.parameter - b.parameter).abs() <= JUST_BEYOND) {
-                sums.add_angles(5, angle_squares(others, &moving, &mean_vector(a), &mean_vector(&b)));
-            }
-        }
-    }
-}
-
-/// Mean over the subjects that take part at `parameter`, over all (extended) where nobody does.
-fn population_mean(population: &Population, parameter: f64) -> DVector<f64> {
-    let nobody = !population.curves.iter().any(|c| c.takes_part(parameter));
-    let there: Vec<DVector<f64>> =
-        population.curves.iter().filter(|c| nobody || c.takes_part(parameter)).map(|c| population.extended(c, parameter)).collect();
-    let n = there.len() as f64;
-    there.into_iter().sum::<DVector<f64>>() / n
-}
-
-/// Mean change from s1 to s2 of the subjects recorded at both, the regression's where there are none.
-fn mean_change(population: &Population, s1: f64, s2: f64) -> DVector<f64> {
-    let changes: Vec<DVector<f64>> =
-        population.curves.iter().filter(|c| c.takes_part(s1) && c.takes_part(s2)).map(|c| c.at(s2) - c.at(s1)).collect();
-    if changes.is_empty() {
-        return &population.slope * (s2 - s1);
-    }
-    let n = changes.len() as f64;
-    changes.into_iter().sum::<DVector<f64>>() / n
-}
-
-/// Which ball joints move in these recordings.
-fn moving_joints(knots: &[Knot]) -> [bool; BALL_JOINTS] {
-    std::array::from_fn(|j| {
-        (0..3).any(|axis| {
-            let values = knots.iter().flat_map(|k| &k.members).flat_map(|m| (0..SAMPLES).map(move |s| m.vector[s * DOF + 3 * j + axis]));
-            let (lo, hi) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(lo, hi), v| (lo.min(v), hi.max(v)));
-            hi - lo > STILL_RAD
-        })
+    let spread = found.iter().map(|f| f.spread).fold((0.0, 0.0), plus);
+    Ok(Validation {
+        scores,
+        angles: by_angle,
+        cases: found.iter().map(|f| f.cases).sum(),
+        sparse_cases: found.iter().map(|f| f.sparse_cases).sum(),
+        sd_ratio: (spread.0 / spread.1).sqrt(),
     })
 }
 
-/// Sum of squared rotation angles between two motion vectors, and how many.
-fn angle_squares(model: &Model, moving: &[bool; BALL_JOINTS], a: &DVector<f64>, b: &DVector<f64>) -> (f64, f64) {
-    let rotation = |v: &DVector<f64>, sample: usize, j: usize| {
-        let at = sample * DOF + 3 * j;
-        model.mean_rotations[j] * exp(&Vector3::new(v[at], v[at + 1], v[at + 2]))
+fn plus(a: Sum, b: Sum) -> Sum {
+    (a.0 + b.0, a.1 + b.1)
+}
+
+fn metric_sum(sums: &Sums, metric: usize) -> Sum {
+    match metric {
+        0 | 1 => sums.distances[metric],
+        2 => sums.angles.iter().copied().fold((0.0, 0.0), plus),
+        _ => sums.positions,
+    }
+}
+
+/// Lines of all subjects and of `all`: roots of pooled squares in a unit, or means.
+fn table(scores: &mut Vec<Score>, method: &'static str, metric: &str, subjects: &[&str], sums: &[Sum], root_unit: Option<f64>) {
+    let value = |(sum, count): Sum| root_unit.map_or(sum / count, |unit| unit * (sum / count).sqrt());
+    let there: Vec<(&str, Sum)> = subjects.iter().copied().zip(sums.iter().copied()).filter(|s| s.1.1 > 0.0).collect();
+    if there.is_empty() {
+        return;
+    }
+    let mut push = |left_out: &str, value| scores.push(Score { method, metric: metric.to_string(), left_out: left_out.to_string(), value });
+    there.iter().for_each(|(subject, sum)| push(subject, value(*sum)));
+    let pooled = there.iter().map(|s| s.1).fold((0.0, 0.0), plus);
+    let mean = there.iter().map(|s| value(s.1)).sum::<f64>() / there.len() as f64;
+    push("all", if root_unit.is_some() { value(pooled) } else { mean });
+}
+
+/// The model without the subject and what comparing needs.
+struct Bench<'a> {
+    others: Model,
+    /// All stored components.
+    population: Population,
+    /// Those of `variance`.
+    truncated: Population,
+    angles: &'a Angles,
+    offsets: [Vector3<f64>; NODES],
+}
+
+fn leave_out(model: &Model, angles: &Angles, subject: &str, variance: f64) -> Result<LeftOut, ModelError> {
+    let cycles =
+        |own: bool| -> Vec<Cycle> { model.members.iter().filter(|m| (m.subject == subject) == own).map(|m| model.cycle_of(m)).collect() };
+    let others = Model::build(model.activity, model.synthetic, &cycles(false))?;
+    let own: Vec<Member> = cycles(true).iter().map(|c| others.member_of(c)).collect();
+    let stature = own.first().map_or(1.0, |m| m.hip_height_m) / HIP_OF_STATURE;
+    let bench = Bench {
+        population: Population::new(&others, others.basis.ncols()),
+        truncated: Population::new(&others, others.components(variance)),
+        others,
+        angles,
+        offsets: Shape::template(stature).offsets(),
     };
-    let (mut sum, mut count) = (0.0, 0.0);
-    for sample in 0..SAMPLES {
-        for j in (0..BALL_JOINTS).filter(|&j| moving[j]) {
-            sum += log(&(rotation(a, sample, j).inverse() * rotation(b, sample, j))).norm_squared();
-            count += 1.0;
+    let sums = Sums { angles: vec![(0.0, 0.0); angles.names().len()], ..Sums::default() };
+    let mut found = LeftOut { methods: vec![sums; METHODS.len()], cases: 0, sparse_cases: 0, spread: (0.0, 0.0) };
+    let own_knots = knots(&own);
+    bench.interpolation(&own_knots, &mut found);
+    bench.variability(&own, &own_knots, &mut found);
+    Ok(found)
+}
+
+impl Bench<'_> {
+    /// The six methods over all ordered pairs of the subject's parameters.
+    fn interpolation(&self, own: &[Knot], found: &mut LeftOut) {
+        let recorded: Vec<Shown> = own.iter().map(|k| self.recorded(k)).collect();
+        let seen: Vec<Observation> = own.iter().map(|k| Observation::of_knot(&self.others, k)).collect();
+        for (to, target) in own.iter().zip(&recorded) {
+            for (from, observed) in own.iter().zip(&seen).filter(|(k, _)| k.parameter != to.parameter) {
+                let Ok(motions) = self.carried(observed, from.parameter, to.parameter, target, found) else { continue };
+                for (row, (weights, detail)) in motions {
+                    found.methods[row as usize].add(self, &self.shown(&weights, detail.as_ref()), target);
+                }
+            }
+            let rest: Vec<Observation> = seen.iter().filter(|o| o.parameter != to.parameter).cloned().collect();
+            if rest.len() > 1
+                && let Ok(several) = transfer(&self.population, &rest, to.parameter)
+            {
+                let shown = self.shown(&several.weights, several.detail.as_ref());
+                found.methods[Row::Several as usize].add(self, &shown, target);
+            }
         }
     }
-    (sum, count)
+
+    /// What each method makes of one observation.
+    fn carried(
+        &self,
+        observed: &Observation,
+        s1: f64,
+        s2: f64,
+        target: &Shown,
+        found: &mut LeftOut,
+    ) -> Result<[(Row, Motion); 5], StyleError> {
+        let (own, detail) = (DVector::from_column_slice(&observed.weights), observed.detail.clone());
+        let default = transfer(&self.population, std::slice::from_ref(observed), s2)?;
+        let paper = extrapolate(&self.truncated, Metric::Paper, &observed.weights, s1, s2)?;
+        found.cases += 1;
+        found.sparse_cases += usize::from(paper.notice.is_some());
+        for ((a, b), sd) in default.weights.iter().zip(&target.weights).zip(default.sd.iter().flatten()).filter(|(_, sd)| **sd > 0.0) {
+            found.spread = plus(found.spread, (((a - b) / sd).powi(2), 1.0));
+        }
+        Ok([
+            (Row::Default, (default.weights, default.detail)),
+            (Row::Paper, (paper.weights, None)),
+            (Row::Mean, (self.population_mean(s2), None)),
+            (Row::Unchanged, (own.clone(), detail.clone())),
+            (Row::MeanChange, (own + self.mean_change(s1, s2), detail)),
+        ])
+    }
+
+    fn variability(&self, own: &[Member], own_knots: &[Knot], found: &mut LeftOut) {
+        let rest: Vec<DVector<f64>> = self.others.members.iter().map(|m| self.others.member_weights(m)).collect();
+        let all: Vec<Shown> = own.iter().map(|m| self.shown_member(m)).collect();
+        for (i, a) in own.iter().enumerate() {
+            let same = |b: &&Member| own_knots.iter().any(|k| [a, *b].iter().all(|m| k.members.iter().any(|n| std::ptr::eq(*n, *m))));
+            for (k, _) in own[..i].iter().enumerate().filter(|(_, b)| same(b)) {
+                found.methods[Row::Intra as usize].add(self, &all[i], &all[k]);
+            }
+            rest.iter().for_each(|b| found.methods[Row::Inter as usize].add_distances(self, &all[i].weights, b));
+        }
+        let recorded: Vec<Shown> = own_knots.iter().map(|k| self.recorded(k)).collect();
+        for subject in self.others.subjects() {
+            for b in knots(self.others.members.iter().filter(|m| m.subject == subject)) {
+                let near = own_knots.iter().zip(&recorded).filter(|(a, _)| (a.parameter - b.parameter).abs() <= JUST_BEYOND);
+                let other = self.recorded(&b);
+                near.for_each(|(_, a)| found.methods[Row::Inter as usize].add_shapes(a, &other));
+            }
+        }
+    }
+
+    /// The mean of recorded cycles.
+    fn recorded(&self, knot: &Knot) -> Shown {
+        let cycles: Vec<Cycle> = knot.members.iter().map(|m| self.others.cycle_of(m)).collect();
+        let mean = Member { vector: mean_vector(knot), root: mean_root(knot), ..(*knot.members[0]).clone() };
+        let shown = self.shown_member(&mean);
+        Shown { angles: self.angles.mean(&cycles).unwrap_or(shown.angles), ..shown }
+    }
+
+    fn shown_member(&self, member: &Member) -> Shown {
+        let cycle = self.others.cycle_of(member);
+        Shown { weights: self.others.member_weights(member), angles: self.angles.of(&cycle), positions: self.positions(&cycle) }
+    }
+
+    fn shown(&self, weights: &DVector<f64>, detail: Option<&Detail>) -> Shown {
+        let (mut vector, mut root) = (self.others.vector(weights.as_slice()), self.others.root(weights.as_slice()));
+        if let Some(detail) = detail {
+            vector += &detail.vector;
+            root += &detail.root;
+        }
+        let (subject, source) = (String::new(), String::new());
+        let cycle = self.others.cycle_of(&Member { subject, source, parameter: 0.0, hip_height_m: 1.0, duration_s: 1.0, vector, root });
+        Shown { weights: weights.clone(), angles: self.angles.of(&cycle), positions: self.positions(&cycle) }
+    }
+
+    /// Positions of [`JOINTS`] in the pelvis, metres, sample by sample.
+    fn positions(&self, cycle: &Cycle) -> Vec<Vector3<f64>> {
+        let placed = |joints: &[UnitQuaternion<f64>; BALL_JOINTS]| {
+            let pose = Pose { root: Vector3::zeros(), world_from_root: UnitQuaternion::identity(), joints: *joints };
+            let placement = place(&self.offsets, &pose);
+            JOINTS.map(|j| placement.position(j))
+        };
+        cycle.joints.iter().flat_map(placed).collect()
+    }
+
+    /// Mean over the subjects that take part at `parameter`, over all (extended) where nobody does.
+    fn population_mean(&self, parameter: f64) -> DVector<f64> {
+        let population = &self.population;
+        let nobody = !population.curves.iter().any(|c| c.takes_part(parameter));
+        let there: Vec<DVector<f64>> =
+            population.curves.iter().filter(|c| nobody || c.takes_part(parameter)).map(|c| population.extended(c, parameter)).collect();
+        let n = there.len() as f64;
+        there.into_iter().sum::<DVector<f64>>() / n
+    }
+
+    /// Mean change from s1 to s2 of the subjects recorded at both, the regression's where there are none.
+    fn mean_change(&self, s1: f64, s2: f64) -> DVector<f64> {
+        let both = self.population.curves.iter().filter(|c| c.takes_part(s1) && c.takes_part(s2));
+        let changes: Vec<DVector<f64>> = both.map(|c| c.at(s2) - c.at(s1)).collect();
+        if changes.is_empty() {
+            return &self.population.slope * (s2 - s1);
+        }
+        let n = changes.len() as f64;
+        changes.into_iter().sum::<DVector<f64>>() / n
+    }
+}
+
+impl Sums {
+    fn add(&mut self, bench: &Bench, a: &Shown, b: &Shown) {
+        self.add_distances(bench, &a.weights, &b.weights);
+        self.add_shapes(a, b);
+    }
+
+    fn add_distances(&mut self, bench: &Bench, a: &DVector<f64>, b: &DVector<f64>) {
+        for (sum, metric) in self.distances.iter_mut().zip([Metric::Paper, Metric::Mahalanobis]) {
+            *sum = plus(*sum, (metric.distance(&bench.truncated.eigenvalues, a, b), 1.0));
+        }
+    }
+
+    fn add_shapes(&mut self, a: &Shown, b: &Shown) {
+        let count = self.angles.len();
+        for (i, (a, b)) in a.angles.iter().zip(&b.angles).enumerate() {
+            let sum = &mut self.angles[i % count];
+            *sum = plus(*sum, (wrapped(a - b).powi(2), 1.0));
+        }
+        for (a, b) in a.positions.iter().zip(&b.positions) {
+            self.positions = plus(self.positions, ((a - b).norm_squared(), 1.0));
+        }
+    }
 }

@@ -100,7 +100,7 @@ fn look(session: &Session, cameras: usize) -> Result<Seen> {
     part.cameras.truncate(cameras);
     part.backgrounds.iter_mut().for_each(|b| b.truncate(cameras));
     let rig = CloudRig::new(&part.rig, Some(&part.stages()?), &options)?;
-    let observations = observe::observe(&part, &rig, &options, |_, _| Ok(()))?;
+    let observations = observe::observe(&part, &rig, &options, None, |_, _| Ok(()))?;
     Ok(Seen { floor_m: rig.floor_m(&part.rig.up.direction()), rig: part.rig, observations })
 }
 

@@ -18,11 +18,10 @@ use muybridge::motion_model::synthetic::{self, SyntheticSubject};
 use muybridge::motion_model::{Activity, Cycle};
 use muybridge::phantom::{Scene, Stage, staging};
 use muybridge::rig::Rig;
-use muybridge::style::{Metric, Population, Style};
+use muybridge::style::{Method, Population, Style};
 use tempfile::TempDir;
 
 use super::check;
-use super::model::default_variance;
 use super::render::{Take, write_session};
 use super::track::{self, NamedModel, Tracked};
 use super::track_report;
@@ -105,14 +104,14 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
     clock.time("check", || announce(&session))?;
     let model = clock.time("model", || NamedModel::synthetic(Activity::Walking))?;
     let seen = clock.time("clouds", || {
-        track::look(&session, |_, frame, found| {
+        track::look(&session, None, |_, frame, found| {
             if frame.number.is_multiple_of(CLOUD_EVERY) {
                 write_ply(&folder.join(format!("clouds/{:06}.ply", frame.number)), &found.cloud)?;
             }
             Ok(())
         })
     })?;
-    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default()))?;
+    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default(), None))?;
     let generated = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
     let rows = clock.time("errors and pictures", || {
         let rows = errors::rows(&truth, &model, &tracked, &generated)?;
@@ -171,9 +170,8 @@ fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Trac
 
 /// As `muybridge generate` does it without options.
 fn at_speed(model: &NamedModel, style: &Style, speed_m_s: f64) -> Result<Synthesis> {
-    let wanted = model.model.components(default_variance(Activity::Walking));
-    let population = Population::new(&model.model, wanted.min(style.weights.len()));
-    Ok(synthesize(&model.model, &population, Metric::Paper, style, speed_m_s, style.hip_height_m)?)
+    let population = Population::new(&model.model, style.weights.len());
+    Ok(synthesize(&model.model, &population, Method::Default, style, speed_m_s, style.hip_height_m)?)
 }
 
 fn marker(truth: &Truth) -> String {

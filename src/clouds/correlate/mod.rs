@@ -71,6 +71,28 @@ impl Region {
     pub fn height(&self) -> usize {
         self.y[1] - self.y[0]
     }
+
+    /// The box around two.
+    pub fn around(self, other: Self) -> Self {
+        let both = |a: [usize; 2], b: [usize; 2]| [a[0].min(b[0]), a[1].max(b[1])];
+        Self { x: both(self.x, other.x), y: both(self.y, other.y) }
+    }
+
+    /// Its upper left pixel.
+    pub fn corner(&self) -> [usize; 2] {
+        [self.x[0], self.y[0]]
+    }
+
+    /// Where its rows lie in a picture of this width.
+    pub fn rows(&self, width: usize) -> impl Iterator<Item = Range<usize>> {
+        let [from, to] = self.x;
+        (self.y[0]..self.y[1]).map(move |y| y * width + from..y * width + to)
+    }
+
+    /// Its part of a picture of this width.
+    pub fn cut<T: Copy>(&self, values: &[T], width: usize) -> Vec<T> {
+        self.rows(width).flat_map(|row| &values[row]).copied().collect()
+    }
 }
 
 /// Gradient pictures of the reference and another view along their baseline; 0 where unknown.

@@ -20,7 +20,7 @@ use super::{Camera, Rig};
 use image::{GrayImage, ImageBuffer, Luma};
 use nalgebra::{Matrix2, Matrix3, Point2, Rotation3, Vector2, Vector3};
 use rayon::prelude::*;
-use warp::{back_map, bicubic, bilinear, warp_map};
+use warp::{back_map, bicubic_row, bilinear, warp_map};
 
 /// A picture of real numbers; NaN where nothing is known.
 pub type Plane = ImageBuffer<Luma<f32>, Vec<f32>>;
@@ -137,15 +137,25 @@ impl Rectification {
 
     /// A raw picture of a view's camera on the rectified grid, Catmull-Rom; NaN where the camera sees nothing.
     pub fn warp(&self, view: usize, raw: &GrayImage) -> Plane {
-        let values = self.views[view].map.par_iter().map(|&[x, y]| bicubic(raw, x, y)).collect();
-        ImageBuffer::from_raw(self.size_px[0], self.size_px[1], values).expect("one map entry per pixel")
+        let width = self.size_px[0].max(1) as usize;
+        let mut plane = Plane::new(self.size_px[0], self.size_px[1]);
+        let rows = plane.par_chunks_exact_mut(width).zip(self.views[view].map.par_chunks_exact(width));
+        rows.for_each(|(out, map)| bicubic_row(raw, map, out));
+        plane
     }
 
-    /// A rectified 0/255 mask on the grid of a view's raw picture; 0 outside the canvas.
-    pub fn unwarp(&self, view: usize, mask: &GrayImage) -> GrayImage {
+    /// A rectified 0/255 mask, whose first pixel lies at `corner` of the canvas, on the grid of a view's raw picture; 0 outside.
+    pub fn unwarp(&self, view: usize, mask: &GrayImage, corner: [usize; 2]) -> GrayImage {
         let [width, height] = self.views[view].camera.size_px;
-        let values = self.views[view].back_map.par_iter().map(|&[x, y]| if bilinear(mask, x, y) >= 127.5 { 255 } else { 0 }).collect();
-        ImageBuffer::from_raw(width, height, values).expect("one map entry per pixel")
+        let [left, top] = corner.map(|c| c as f32);
+        let mut raw = GrayImage::new(width, height);
+        let rows = raw.par_chunks_exact_mut(width.max(1) as usize).zip(self.views[view].back_map.par_chunks_exact(width.max(1) as usize));
+        rows.for_each(|(out, map)| {
+            for (out, [x, y]) in out.iter_mut().zip(map) {
+                *out = if bilinear(mask, x - left, y - top) >= 127.5 { 255 } else { 0 };
+            }
+        });
+        raw
     }
 
     fn pixel_of_direction(&self, direction: &Vector3<f64>) -> Option<Vector2<f64>> {

@@ -255,7 +255,7 @@ fn warped_pictures_show_points_where_they_belong() {
         }
         assert!(known > 200_000, "view {view} shows {known} pixels");
         let white = GrayImage::from_pixel(rectification.size_px[0], rectification.size_px[1], Luma([255]));
-        let back = rectification.unwarp(view, &white);
+        let back = rectification.unwarp(view, &white, [0, 0]);
         assert!(back.iter().filter(|&&v| v == 255).count() > 300_000);
     }
 }

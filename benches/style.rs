@@ -1,0 +1,66 @@
+//! Motion models: PCA of 324 cycles beside scikit-learn's, and postures per second.
+//!
+//! The peer is `peers/pca_sklearn.py`, full PCA of the same 324 x 7800 matrix, all threads that it wants; PYTHON names the
+//! interpreter with numpy and scikit-learn (`python3` without it). Where it does not run, that is said.
+//! Postures run on one thread, from weights and a phase to the 26 joint rotations and the root, phases in no order.
+
+use std::hint::black_box;
+use std::path::Path;
+use std::process::Command;
+use std::time::Instant;
+
+use muybridge::math::pca::pca;
+use muybridge::motion_model::{Activity, Model, synthetic};
+use nalgebra::DMatrix;
+
+const ROUNDS: usize = 7;
+const POSTURES: usize = 200_000;
+
+fn main() {
+    let model = Model::build(Activity::Walking, true, &synthetic::database(Activity::Walking)).expect("the embedded database");
+    let columns: Vec<_> = model.members.iter().map(|m| m.vector.clone()).collect();
+    let vectors = DMatrix::from_columns(&columns);
+    let ours_ms = (0..ROUNDS).map(|_| timed_ms(|| black_box(pca(&vectors)).eigenvalues.len())).fold(f64::MAX, f64::min);
+    println!("PCA of {} cycles x {}: {ours_ms:.1} ms", vectors.ncols(), vectors.nrows());
+    match peer_ms(&vectors) {
+        Ok(theirs_ms) => println!("scikit-learn, full: {theirs_ms:.1} ms, ratio {:.2}", ours_ms / theirs_ms),
+        Err(why) => println!("scikit-learn: {why}; PYTHON=... names an interpreter that has it"),
+    }
+    println!("\n| weights | ns per posture | postures per second |\n|---|---|---|");
+    let weights = model.member_weights(&model.members[100]);
+    for count in [0, 2, 5, 10, 20, 40] {
+        let used = &weights.as_slice()[..count.min(weights.len())];
+        let best = (0..ROUNDS).map(|_| timed_ms(|| postures(&model, used))).fold(f64::MAX, f64::min);
+        let each_ns = 1e6 * best / POSTURES as f64;
+        println!("| {} | {each_ns:.0} | {:.2} million |", used.len(), 1e3 / each_ns);
+    }
+}
+
+fn postures(model: &Model, weights: &[f64]) -> usize {
+    // Steps of the golden section fill the cycle evenly and in no order.
+    let mut phase = 0.0;
+    for _ in 0..POSTURES {
+        phase = (phase + 0.618_033_988_749_895) % 1.0;
+        black_box(model.posture(black_box(weights), phase));
+    }
+    POSTURES
+}
+
+fn timed_ms<T>(run: impl FnOnce() -> T) -> f64 {
+    let start = Instant::now();
+    black_box(run());
+    1e3 * start.elapsed().as_secs_f64()
+}
+
+/// Least time of the peer over its own rounds.
+fn peer_ms(vectors: &DMatrix<f64>) -> Result<f64, String> {
+    let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
+    let file = folder.path().join("vectors.f64");
+    let bytes: Vec<u8> = vectors.as_slice().iter().flat_map(|v| v.to_le_bytes()).collect();
+    std::fs::write(&file, bytes).map_err(|e| e.to_string())?;
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/peers/pca_sklearn.py");
+    let python = std::env::var("PYTHON").unwrap_or("python3".into());
+    let output = Command::new(python).arg(script).arg(&file).arg(vectors.ncols().to_string()).output().map_err(|e| e.to_string())?;
+    let (text, error) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    text.trim().parse().map_err(|_| error.lines().last().unwrap_or("no output").to_string())
+}
