@@ -36,7 +36,7 @@ fn model(path: &Path) {
 fn film(folder: &Path, session: &str) -> Cycle {
     let subject = synthetic::subject(Activity::Walking, 3);
     let cycle = subject.mean_cycle(SPEED_M_S);
-    let clip = play_cycle(&cycle, &subject.shape().offsets(), 30.0, Length::Seconds(1.5));
+    let clip = play_cycle(&cycle, &subject.shape().offsets(), 30.0, Length::Seconds(1.1));
     let motion = folder.join("walk.bvh");
     bvh::write_clip(&motion, &clip, None).unwrap();
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("calib/phantom_lab.toml");
@@ -211,13 +211,13 @@ fn every_page_is_whole_harmless_and_readable() {
 
     // The study's rows are sorted by a click, numbers as numbers.
     reader.open(&study);
-    let names = "return [...document.querySelectorAll('#sessions tbody tr')].map(r => r.cells[1].textContent);";
+    let names = "return [...document.querySelectorAll('#study tbody tr')].map(r => r.cells[1].textContent);";
     assert_eq!(reader.browser.script(names)[0], json!(NASTY));
-    reader.browser.click("#sessions th:nth-child(2) button");
+    reader.browser.click("#study th:nth-child(2) button");
     assert_eq!(reader.browser.script(names), json!([NASTY, "walk_1", "walk_2", "walk_10"]));
-    reader.browser.click("#sessions th:nth-child(5) button");
+    reader.browser.click("#study th:nth-child(5) button");
     assert_eq!(reader.browser.script(names), json!(["walk_10", "walk_2", NASTY, "walk_1"]));
-    reader.browser.click("#sessions tbody a");
+    reader.browser.click("#study tbody a");
     reader.browser.wait("document.querySelector('.kicker')?.textContent === 'muybridge track'");
     reader.browser.call("DELETE", "", json!({}));
 }

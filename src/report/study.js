@@ -1,6 +1,6 @@
 'use strict';
 (() => {
-  const table = document.getElementById('sessions'), body = table.tBodies[0];
+  const table = document.getElementById('study'), body = table.tBodies[0];
   const headings = [...table.tHead.rows[0].cells];
   const key = cell => (cell.dataset.key ?? cell.textContent).trim();
   const compare = (a, b) => {

@@ -78,7 +78,7 @@ fn body(study: &Study, rows: &[&StudyRow]) -> Markup {
     html! {
         p.soft.small { "Failures first. A click on a heading sorts; the name opens the session's own report." }
         div.scroll {
-            table.study id="sessions" {
+            table.study id="study" {
                 thead {
                     tr {
                         @if pictures { th scope="col" {} }

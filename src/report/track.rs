@@ -5,7 +5,7 @@ use image::{GrayImage, RgbImage};
 use maud::{Markup, html};
 use nalgebra::Vector3;
 
-use super::page::{Grade, Section, Verdict, facts, gallery, page, picture, png_uri, table, tiles};
+use super::page::{Grade, Section, Verdict, facts, page, picture, png_uri, table, tiles};
 use super::walk::Walk;
 use super::{CloudDot, ReportError, cloud_and_body, person, person_depth, style_charts, track_charts, view3d, walk};
 use crate::body::{Joint, NODES, Placement, PosedSurface, Surface, place};
@@ -168,7 +168,7 @@ impl TrackReport<'_> {
         let instants = view3d::shown(placements.len().min(self.observations.len())).into_iter().map(instant).collect();
         let view = view3d::View { shape: self.fit.shape(), up: self.rig.up, towards_viewer: viewpoint - middle, instants };
         Ok(html! {
-            (gallery(&figures))
+            div.gallery.halves { @for figure in &figures { (figure) } }
             (view3d::view(&view))
         })
     }
