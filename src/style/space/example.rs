@@ -1,9 +1,9 @@
 //! One motion as curves: what the space is built from, and what a person gives it to change.
 
-use nalgebra::{DMatrix, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, DVector, UnitQuaternion, Vector2, Vector3};
 
 use super::interpolate::at;
-use crate::body::{BALL_JOINTS, Clip, DOF};
+use crate::body::{BALL_JOINTS, Clip, DOF, Joint, Pose, Shape, place};
 use crate::math::rotation::{exp, log};
 use crate::motion_model::{Cycle, RootSample};
 
@@ -52,7 +52,7 @@ impl Example {
         let facing = first.world_from_root * Vector3::z();
         let carrier_from_world = exp(&Vector3::new(0.0, -facing.x.atan2(facing.z), 0.0));
         let origin = Vector3::new(first.root.x, clip.hip_height_m, first.root.z);
-        let root = |pose: &crate::body::Pose| RootSample {
+        let root = |pose: &Pose| RootSample {
             rotation: log(&(carrier_from_world * pose.world_from_root)),
             position: carrier_from_world * (pose.root - origin) / clip.hip_height_m,
         };
@@ -85,8 +85,16 @@ impl Example {
                 unwrap(&mut values, curve);
             }
         }
-        Curves { values, cyclic: self.cyclic, stride: self.stride }
+        let feet: Vec<_> = self.postures.iter().map(feet).collect();
+        Curves { values, feet: DMatrix::from_columns(&feet), cyclic: self.cyclic, stride: self.stride }
     }
+}
+
+/// How far the left and the right ankle are ahead of the root, over the stature of a template body.
+fn feet((joints, root): &Posture) -> Vector2<f64> {
+    let pose = Pose { root: Vector3::zeros(), world_from_root: exp(&root.rotation), joints: *joints };
+    let placed = place(&Shape::template(1.0).offsets(), &pose);
+    Vector2::new(placed.position(Joint::LAnkle).z, placed.position(Joint::RAnkle).z)
 }
 
 /// Rotation vectors jump where an angle passes π; each is replaced by the equal one nearest to its predecessor.
@@ -108,6 +116,8 @@ fn unwrap(values: &mut DMatrix<f64>, first: usize) {
 pub struct Curves {
     /// Curves × samples.
     pub values: DMatrix<f64>,
+    /// How far left and right ankle are ahead of the root × samples: evidence for the warp, not part of a shape.
+    pub feet: DMatrix<f64>,
     pub cyclic: bool,
     /// What the last curve gains in one cycle.
     pub stride: f64,
@@ -120,10 +130,16 @@ impl Curves {
         (0..=intervals).map(|k| k as f64 / intervals as f64).collect()
     }
 
+    /// The feet at part `time` of the duration.
+    pub fn feet_at(&self, times: &[f64], time: f64) -> DVector<f64> {
+        let (samples, weights, _) = at(times, self.cyclic, time);
+        samples.into_iter().zip(weights).fold(DVector::zeros(2), |sum, (sample, weight)| sum + self.feet.column(sample) * weight)
+    }
+
     /// All curves at part `time` of the duration, where `times` are [`Curves::times`].
-    pub fn at(&self, times: &[f64], time: f64) -> nalgebra::DVector<f64> {
+    pub fn at(&self, times: &[f64], time: f64) -> DVector<f64> {
         let (samples, weights, wraps) = at(times, self.cyclic, time);
-        let mut sum = nalgebra::DVector::zeros(self.values.nrows());
+        let mut sum = DVector::zeros(self.values.nrows());
         for ((sample, weight), wrap) in samples.into_iter().zip(weights).zip(wraps) {
             sum.axpy(weight, &self.values.column(sample), 1.0);
             if let Some(progress) = sum.get_mut(PROGRESS) {
