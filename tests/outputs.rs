@@ -82,7 +82,7 @@ fn check_motions(out: &Path) {
         let text = std::fs::read_to_string(at("bvh")).unwrap();
         assert!(text.contains("CHANNELS 3 Xrotation Yrotation Zrotation"));
         let clip = read_clip(&at("bvh")).unwrap().clip;
-        assert_eq!(glb::read(&at("glb")).unwrap().motions, [motion.clone()]);
+        assert_eq!(glb::read(&at("glb")).unwrap().motions, std::slice::from_ref(&motion));
         let c3d = c3dio::C3d::load_path(at("c3d")).unwrap();
         let column = c3d.points.labels.iter().position(|l| l.trim() == "l_wrist").unwrap();
         let trc = std::fs::read_to_string(at("trc")).unwrap();
@@ -114,7 +114,7 @@ fn a_folder_of_outputs_counts_every_motion_once() {
     let out = folder.path().join("out");
     let (done, error) = run(&["generate", "--model", &model, "--style", &style, "--at", "1.2", "-o", &out.to_string_lossy()]);
     assert!(done, "{error}");
-    let found = find_motions(&[out.clone()], None).unwrap();
+    let found = find_motions(std::slice::from_ref(&out), None).unwrap();
     assert_eq!(found.len(), 1);
     assert!(found[0].path.ends_with("walking_1.20.bvh"));
     // Four cycles are enough to be drawn below what is generated from them.

@@ -79,8 +79,7 @@ fn cycles_and_speeds_of_every_shared_trial() {
     }
     let folders: Vec<PathBuf> = SETS.iter().map(|s| data.join(s.1)).collect();
     let entries = find_motions(&folders, None).unwrap();
-    let rows: Vec<(Expected, Found)> =
-        expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
+    let rows: Vec<(Expected, Found)> = expected(&data).into_par_iter().map(|e| (found(&entries, &e), e)).map(|(f, e)| (e, f)).collect();
     for (e, found) in &rows {
         let what = match found {
             Ok((cycles, speed)) => format!("{cycles:>2} {speed:>6.2}"),

@@ -204,7 +204,7 @@ mod tests {
                     Kind::Zxy(mirror) => {
                         let m = *mirror;
                         let [z, x, y] =
-                            [-Vector3::x() * turns[0], Vector3::z() * *m * turns[1], Vector3::y() * *m * turns[2]].map(|v| exp(&v));
+                            [-Vector3::x() * turns[0], Vector3::z() * m * turns[1], Vector3::y() * m * turns[2]].map(|v| exp(&v));
                         z * x * y
                     }
                     Kind::Hinges(axes) => axes.iter().zip(&turns).fold(UnitQuaternion::identity(), |q, (a, t)| q * exp(&(a * *t))),

@@ -86,7 +86,8 @@ impl Example {
             }
         }
         let feet: Vec<_> = self.postures.iter().map(feet).collect();
-        Curves { values, feet: DMatrix::from_columns(&feet), cyclic: self.cyclic, stride: self.stride }
+        let feet = DMatrix::from_fn(2, count, |side, k| feet[k][side]);
+        Curves { values, feet, cyclic: self.cyclic, stride: self.stride }
     }
 }
 
