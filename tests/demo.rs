@@ -62,9 +62,9 @@ fn the_whole_job_ends_near_the_truth_and_does_not_depend_on_threads() {
     assert!(value(weights) < 0.7 * other(weights, "to other people"), "{csv}");
     for kmh in [3, 4, 5, 6, 7] {
         let [angles, joints] = ["angles", "joints"].map(|what| format!("at {kmh} km/h; {what}"));
-        assert!(value(&joints) < 1.1 * other(&joints, "average person") && value(&joints) < 45.0, "{csv}");
+        assert!(value(&joints) < 0.85 * other(&joints, "average person"), "{csv}");
         // What footage and fit add to the error of generating from the truth itself.
-        assert!((value(&angles) - other(&angles, "true style")).abs() < 1.5, "{csv}");
+        assert!(value(&angles) < other(&angles, "true style") + 2.0 && value(&angles) < 0.65 * other(&angles, "average person"), "{csv}");
         let (speed, fps) = speed_and_rate(&output.join(format!("generated/walking_{kmh}kmh.bvh")));
         assert!((speed * 3.6 / f64::from(kmh) - 1.0).abs() < 0.01 && (fps - 60.0).abs() < 0.01, "{kmh}: {speed} {fps}");
     }

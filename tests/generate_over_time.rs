@@ -198,7 +198,7 @@ fn recorded_jumps_are_made_at_other_lengths() {
             let label =
                 Label { subject: "x".into(), source: "x".into(), activity: Activity::Jumping, parameter: None, start_s: None, end_s: None };
             let cycles = segment(&read_clip(&bvh).unwrap().clip, &label).unwrap().cycles;
-            assert!(cycles.len() == 1 && (cycles[0].parameter / length - 1.0).abs() < 0.06, "{trial} {name}: {}", cycles[0].parameter);
+            assert!(cycles.len() == 1 && (cycles[0].parameter / length - 1.0).abs() < 0.08, "{trial} {name}: {}", cycles[0].parameter);
         }
     }
 }

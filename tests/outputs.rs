@@ -83,7 +83,7 @@ fn check_motions(out: &Path) {
         assert!(text.contains("CHANNELS 3 Xrotation Yrotation Zrotation"));
         let clip = read_clip(&at("bvh")).unwrap().clip;
         let read = glb::read(&at("glb")).unwrap().motions;
-        assert!(read.len() == 1 && read[0] == motion);
+        assert!(read.len() == 1 && read[0] == *motion);
         let c3d = c3dio::C3d::load_path(at("c3d")).unwrap();
         let column = c3d.points.labels.iter().position(|l| l.trim() == "l_wrist").unwrap();
         let trc = std::fs::read_to_string(at("trc")).unwrap();

@@ -215,12 +215,12 @@ mod tests {
 
     #[test]
     fn a_manifest_stands_for_its_folder() {
-        let rows = "file,subject,activity,speed_m_s,start_s,end_s\nik/r.mot,s1,running,3.0,,\nik/r.mot,,walking,,0.5,2\n";
-        let dir = folder(&[("subjects.csv", rows), ("ik/r.mot", ""), ("ik/unlisted.mot", "")]);
+        let rows = "file,subject,activity,speed_m_s,start_s,end_s\ns2/r.mot,s1,running,3.0,,\ns2/r.mot,,walking,,0.5,2\n";
+        let dir = folder(&[("subjects.csv", rows), ("s2/r.mot", ""), ("s2/unlisted.mot", "")]);
         let found = find_motions(&[dir.path().to_path_buf()], None).unwrap();
         assert_eq!(found.len(), 2);
         assert_eq!((found[0].subject.as_str(), found[0].activity, found[0].parameter), ("s1", Some(Activity::Running), Some(3.0)));
-        assert_eq!((found[1].subject.as_str(), found[1].start_s, found[1].end_s), ("ik", Some(0.5), Some(2.0)));
+        assert_eq!((found[1].subject.as_str(), found[1].start_s, found[1].end_s), ("s2", Some(0.5), Some(2.0)));
     }
 
     #[test]

@@ -198,7 +198,7 @@ mod tests {
         let s = synthesize(&model, &population, Method::Default, &style, member.parameter, member.hip_height_m).unwrap();
         let clip = play(&model, &s, &Shape::template(1.7).offsets(), 100.0, Length::Seconds(0.5));
         assert_eq!(clip.poses.len(), 51);
-        let expected = model.cycle(model.member_weights(&member).as_slice(), "", member.parameter, member.hip_height_m, member.duration_s);
+        let expected = model.cycle_of(&member);
         for (i, pose) in clip.poses.iter().enumerate() {
             let at = i as f64 * s.frequency_hz;
             let (k, part) = (at as usize, at - at.floor());

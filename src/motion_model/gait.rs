@@ -156,7 +156,10 @@ fn steps(track: &Track, strikes_s: [&[f64]; 2], places: [&[Option<Vector2<f64>>]
         if time_s > 0.75 * stride_s? {
             return None;
         }
-        let d = way(track, strikes_s[1][before], *at_s)?;
+        // Over a whole stride, in which the root sways to both sides.
+        let (stride_s, last_s) = (stride_s?, (track.poses.len() - 1) as f64 / track.fps);
+        let from_s = (at_s - 0.5 * (time_s + stride_s)).clamp(0.0, (last_s - stride_s).max(0.0));
+        let d = way(track, from_s, from_s + stride_s)?;
         let length_width_m = places[0][i].zip(places[1][before]).map(|(here, there)| {
             let step = here - there;
             // x left, z forward: the left of (0, 1) is (1, 0).

@@ -244,7 +244,7 @@ mod tests {
         let text = chart.figure().into_string();
         // The drawing is 342 by 186.
         assert!(text.contains("d=\"M0 186L85.5 93M256.5 93L342 0\""), "{text}");
-        assert_eq!(text.matches("class=\"band f1\"").count(), 2);
+        assert_eq!(text.matches("<path class=\"band f1\"").count(), 2);
         assert!(text.contains("d=\"M0 139.5L85.5 46.5L85.5 139.5L0 232.5Z\""), "{text}");
         assert!(text.contains("a &amp; b") && text.contains("&lt;t&gt;") && !text.contains("<t>"));
     }
