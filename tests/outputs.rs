@@ -54,7 +54,7 @@ fn every_format_holds_the_same_motion() {
     let names: Vec<&str> = written.iter().map(|(name, _)| name.as_str()).collect();
     let of_value = ["bvh", "c3d", "glb", "json", "mot", "trc"];
     let mut expected: Vec<String> = ["1.00", "1.50"].iter().flat_map(|v| of_value.map(|e| format!("walking_{v}.{e}"))).collect();
-    expected.extend(["generated.csv", "outputs.json", "strips.png", "strips.svg", "walking.glb"].map(String::from));
+    expected.extend(["generated.csv", "outputs.json", "report.html", "strips.png", "strips.svg", "walking.glb"].map(String::from));
     expected.sort();
     assert_eq!(names, expected);
     check_motions(&out);

@@ -91,7 +91,7 @@ fn points_of_c3d_files_are_those_of_another_reader() {
         compared += 1;
     }
     println!("{} C3D files, {read_by_us} read, {compared} equal to c3dio's", all.len());
-    assert_eq!((read_by_us, compared), (83, 72));
+    assert!(read_by_us + 2 >= all.len() && 5 * compared > 3 * all.len(), "{read_by_us} {compared}");
 }
 
 #[test]

@@ -57,7 +57,17 @@ fn peaks(times: &[f64], curve: &[f64]) -> Vec<f64> {
         let (a, b, c) = (smoothed[i - 1], smoothed[i], smoothed[i + 1]);
         times[i] + step * 0.5 * (a - c) / (a - 2.0 * b + c)
     };
-    (1..curve.len() - 1).filter(is_peak).map(at).collect()
+    // The highest first, none within 0.45 s of a higher one.
+    let mut found: Vec<usize> = (1..curve.len() - 1).filter(is_peak).collect();
+    found.sort_by(|a, b| smoothed[*b].total_cmp(&smoothed[*a]));
+    let mut kept: Vec<f64> = Vec::new();
+    for time in found.into_iter().map(at) {
+        if kept.iter().all(|k| (k - time).abs() > 0.45) {
+            kept.push(time);
+        }
+    }
+    kept.sort_by(f64::total_cmp);
+    kept
 }
 
 /// Cycles as members whose first 26 coordinates of every sample are the angles, radians.

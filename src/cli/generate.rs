@@ -115,6 +115,7 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     if !model.activity.is_cyclic() && (args.profile.is_some() || args.turn_radius.is_some()) {
         bail!("{} holds jumps; --profile and --turn-radius are for walking and running", args.model.display());
     }
+    let values: Vec<f64> = args.at.iter().map(|v| parameter(v, model.activity)).collect::<Result<_>>()?;
     let mut style = load_style(&args.model, &model, &args.style, args.recorded_at.as_deref())?;
     for text in &args.also {
         let (path, recorded_at) = text.rsplit_once('@').map_or((text.as_str(), None), |(path, at)| (path, Some(at)));
@@ -123,13 +124,12 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     let shape = target_shape(&args, &style);
     match &args.profile {
         Some(text) => along_profile(&args, &model, &style, &shape, &profile::read(text, args.turn_radius)?),
-        None => at_values(&args, &model, &style, &shape),
+        None => at_values(&args, &model, &style, &shape, &values),
     }
 }
 
-fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Result<()> {
-    let values: Vec<f64> = args.at.iter().map(|v| parameter(v, model.activity)).collect::<Result<_>>()?;
-    let names = file_names(model.activity, &values)?;
+fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, values: &[f64]) -> Result<()> {
+    let names = file_names(model.activity, values)?;
     let (population, method) = (population(args, model, style)?, method(args)?);
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
