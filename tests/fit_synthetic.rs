@@ -7,7 +7,7 @@ use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
 use muybridge::fit::state::{Carrier, State, Turns};
-use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, resume};
+use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, fit, resume};
 use muybridge::math::arrow::{LmOptions, minimise};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{Figure, SightOptions, joint_errors, sighting, staging};
@@ -101,6 +101,16 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
         assert!(apart.abs() < 0.02 && (a.position - b.position).norm() < 0.03, "{apart} {}", a.position - b.position);
         assert!(a.world_from_carrier.angle_to(&b.world_from_carrier) < 0.08);
     }
+    // Ten frames in which nothing was seen, and points that are no numbers.
+    let mut gaps = observations.clone();
+    for o in &mut gaps[9..19] {
+        (o.cloud, o.masks) = (Cloud::default(), vec![None; rig.cameras.len()]);
+    }
+    let nowhere = CloudPoint { position: Vector3::repeat(f64::NAN), ..gaps[3].cloud.points[0].clone() };
+    gaps[3].cloud.points.push(nowhere);
+    let bridged = fit(&gaps, &rig, &model, Some(floor), &options, &|_| true).unwrap();
+    let errors = joint_errors(&positions(&bridged.state, &bridged.poses), &positions(&truth, &true_poses));
+    assert!(bridged.poses.len() == 26 && errors.absolute_m < 0.03 && errors.swapped_over_straight > 2.0, "{errors:?}");
     // Stopped late and taken up again, it ends as if nothing had been.
     let kept = kept.into_inner();
     let until = &kept[..kept.len() * 9 / 10];
