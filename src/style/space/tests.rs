@@ -35,7 +35,7 @@ fn shape_played_at_its_timing_is_the_motion_itself() {
         for (member, example) in space.members.iter().zip(&examples) {
             let blend = space.play(&member.vectors);
             let (angle, length) = differences(&blend, example);
-            assert!(angle < 0.5f64.to_radians() && length < 1e-3, "{}: {} {length}", member.name, angle.to_degrees());
+            assert!(angle < 0.7f64.to_radians() && length < 1e-3, "{}: {} {length}", member.name, angle.to_degrees());
             assert!((blend.duration_s() - example.duration_s).abs() < 1e-9);
             assert!((blend.speed_m_s(example.hip_height_m) * example.duration_s / example.hip_height_m - example.stride).abs() < 1e-9);
             // Another walker's shape would not pass.
