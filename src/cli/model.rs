@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, Subcommand};
-use muybridge::io::manifest::find_motions;
+use muybridge::io::manifest::{Entry, find_motions};
 use muybridge::io::model_npz::{model_hash, read_model, write_model};
 use muybridge::io::write_atomic;
 use muybridge::motion_model::{Activity, Model, database, synthetic};
@@ -37,8 +37,9 @@ pub enum ModelCommand {
     Validate(ValidateArgs),
 }
 
+/// Motions and what of them a model takes.
 #[derive(Args)]
-pub struct BuildArgs {
+struct RecordedArgs {
     /// Motion files (.bvh, .amc, .c3d, .trc, .mot) or folders, searched to the bottom
     #[arg(required = true, value_name = "MOCAP")]
     inputs: Vec<PathBuf>,
@@ -48,14 +49,26 @@ pub struct BuildArgs {
     /// Subject or trial to leave out; repeat for several
     #[arg(long, value_name = "SUBJECT or TRIAL")]
     exclude: Vec<String>,
+    /// Components that the file keeps, for less detail at less cost; those that hold 99 % of the variance without it
+    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u16).range(1..))]
+    components: Option<u16>,
+}
+
+impl RecordedArgs {
+    fn entries(&self) -> Result<Vec<Entry>> {
+        exclude(find_motions(&self.inputs, self.manifest.as_deref())?, &self.exclude)
+    }
+}
+
+#[derive(Args)]
+pub struct BuildArgs {
+    #[command(flatten)]
+    recorded: RecordedArgs,
     #[arg(long)]
     activity: ActivityName,
     /// Table (CSV) of what was found in every file: cycles, speed, duration, and why anything was left out
     #[arg(long, value_name = "FILE")]
     table: Option<PathBuf>,
-    /// Components that the file keeps, for less detail at less cost; those that hold 99 % of the variance without it
-    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u16).range(1..))]
-    components: Option<u16>,
     /// Model file to write
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -65,18 +78,8 @@ pub struct BuildArgs {
 pub struct UpdateArgs {
     /// Model file (.npz); stays as it is
     model: PathBuf,
-    /// Motion files or folders of the model's activity
-    #[arg(required = true, value_name = "MOCAP")]
-    inputs: Vec<PathBuf>,
-    /// Table of the files: file,subject,activity,speed_m_s or length_m,start_s,end_s
-    #[arg(long, value_name = "FILE")]
-    manifest: Option<PathBuf>,
-    /// Subject or trial to leave out; repeat for several
-    #[arg(long, value_name = "SUBJECT or TRIAL")]
-    exclude: Vec<String>,
-    /// Components that the file keeps; those that hold 99 % of the variance without it
-    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u16).range(1..))]
-    components: Option<u16>,
+    #[command(flatten)]
+    recorded: RecordedArgs,
     /// Model file to write
     #[arg(short, long, value_name = "NEW")]
     output: PathBuf,
@@ -124,7 +127,7 @@ pub fn default_variance(activity: Activity) -> f64 {
 
 fn build(args: BuildArgs) -> Result<()> {
     let activity = args.activity.into();
-    let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
+    let entries = args.recorded.entries()?;
     let recordings = read_recordings(&entries, activity);
     if let Some(path) = &args.table {
         let text = format!("{TABLE}\n{}\n", recordings.table.join("\n"));
@@ -145,7 +148,7 @@ fn build(args: BuildArgs) -> Result<()> {
             database::MEDIAN_MULTIPLE
         );
     }
-    let model = detailed(Model::build(activity, false, &cycles)?, args.components);
+    let model = detailed(Model::build(activity, false, &cycles)?, args.recorded.components);
     write_model(&args.output, &model)?;
     println!(
         "{found} cycles from {} files, {} stretches or files left out, {} cycles kept",
@@ -166,13 +169,13 @@ fn detailed(model: Model, components: Option<u16>) -> Model {
 
 fn update(args: UpdateArgs) -> Result<()> {
     let model = read_model(&args.model)?;
-    let entries = exclude(find_motions(&args.inputs, args.manifest.as_deref())?, &args.exclude)?;
+    let entries = args.recorded.entries()?;
     let recordings = read_recordings(&entries, model.activity);
     recordings.left_out.iter().for_each(|line| eprintln!("left out: {line}"));
     if recordings.cycles.is_empty() {
         bail!("none of {} motions can be used for {}{}", entries.len(), model.activity, recordings.first_reason());
     }
-    let updated = detailed(model.with(&recordings.cycles)?, args.components);
+    let updated = detailed(model.with(&recordings.cycles)?, args.recorded.components);
     write_model(&args.output, &updated)?;
     println!("{} cycles from {} files added to {} of the model", recordings.cycles.len(), recordings.files, model.members.len());
     print!("{}", description(&args.output, &updated));
