@@ -16,6 +16,7 @@ use muybridge::motion_model::{Activity, Cycle, Model};
 use muybridge::report::generated::{self, GeneratedReport};
 use muybridge::style::{Method, Metric, Population, Style};
 
+use super::manner::MannerArgs;
 use super::model::default_variance;
 use super::motions::{file_name, read_recordings};
 use super::outputs::{Made, OutputArgs};
@@ -92,6 +93,8 @@ pub struct GenerateArgs {
     #[arg(long, default_value_t = 60.0, value_parser = super::positive)]
     fps: f64,
     #[command(flatten)]
+    manner: MannerArgs,
+    #[command(flatten)]
     files: OutputArgs,
 }
 
@@ -112,8 +115,8 @@ fn method(args: &GenerateArgs) -> Result<Method> {
 
 pub fn run(args: GenerateArgs) -> Result<()> {
     let model = read_model(&args.model)?;
-    if !model.activity.is_cyclic() && (args.profile.is_some() || args.turn_radius.is_some()) {
-        bail!("{} holds jumps; --profile and --turn-radius are for walking and running", args.model.display());
+    if !model.activity.is_cyclic() && (args.profile.is_some() || args.turn_radius.is_some() || !args.manner.is_plain()) {
+        bail!("{} holds jumps; --profile, --turn-radius, --attribute and --caricature are for walking and running", args.model.display());
     }
     let values: Vec<f64> = args.at.iter().map(|v| parameter(v, model.activity)).collect::<Result<_>>()?;
     let mut style = load_style(&args.model, &model, &args.style, args.recorded_at.as_deref())?;
@@ -123,7 +126,10 @@ pub fn run(args: GenerateArgs) -> Result<()> {
     }
     let shape = target_shape(&args, &style);
     match &args.profile {
-        Some(text) => along_profile(&args, &model, &style, &shape, &profile::read(text, args.turn_radius)?),
+        Some(text) => {
+            let profile = profile::read(text, args.turn_radius)?.with_amounts(args.manner.courses()?);
+            along_profile(&args, &model, &style, &shape, &profile)
+        }
         None => at_values(&args, &model, &style, &shape, &values),
     }
 }
@@ -135,17 +141,20 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, v
     let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
     let (mut motions, mut syntheses) = (Vec::new(), Vec::new());
     for (value, name) in values.iter().zip(&names) {
-        let synthesis = synthesize(model, &population, method, style, *value, shape.hip_height_m())?;
+        let mut synthesis = synthesize(model, &population, method, style, *value, shape.hip_height_m())?;
         if let Some(notice) = &synthesis.notice {
             eprintln!("notice: {name}: {notice}");
         }
-        let clip = match args.turn_radius {
-            None => play(model, &synthesis, &shape.offsets(), args.fps, length),
-            Some(radius_m) => {
-                let gaits = Gaits::one(Gait::steady(model, &synthesis, &shape.offsets()).context("no gait at this speed")?);
-                let seconds = length.seconds(synthesis.frequency_hz);
-                follow(&gaits, &Profile::steady(*value, radius_m.recip(), seconds)?, &shape.offsets(), args.fps).0
-            }
+        let clip = if args.turn_radius.is_none() && args.manner.is_plain() {
+            play(model, &synthesis, &shape.offsets(), args.fps, length)
+        } else {
+            let mut gait = Gait::steady(model, &synthesis, &shape.offsets()).context("no gait at this speed")?;
+            args.manner.teach(&mut gait, || Gait::typical(model, &population, shape.hip_height_m(), &shape.offsets()), *value)?;
+            let courses = args.manner.courses()?;
+            synthesis.frequency_hz *= gait.cadence_factor(courses.iter().map(|c| c.at(0.0)));
+            let seconds = length.seconds(synthesis.frequency_hz);
+            let profile = Profile::steady(*value, args.turn_radius.map_or(0.0, f64::recip), seconds)?.with_amounts(courses);
+            follow(&Gaits::one(gait), &profile, &shape.offsets(), args.fps).0
         };
         let clip = planted(args, name, clip);
         println!("{}: {} frames, {:.3} cycles/s", args.output.join(name).display(), clip.poses.len(), synthesis.frequency_hz);
@@ -224,10 +233,12 @@ fn steps_csv(steps: &[Step]) -> String {
 fn gait(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Result<Gait> {
     let population = population(args, model, style)?;
     let found = Gait::of_style(model, &population, method(args)?, style, shape.hip_height_m(), &shape.offsets())?;
-    let (gait, notice) = found.with_context(|| format!("the speeds of {} make no gait", model.activity))?;
+    let (mut gait, notice) = found.with_context(|| format!("the speeds of {} make no gait", model.activity))?;
     if let Some(notice) = notice {
         eprintln!("notice: {notice}");
     }
+    let typical = || Gait::typical(model, &population, shape.hip_height_m(), &shape.offsets());
+    args.manner.teach(&mut gait, typical, style.parameter * shape.hip_height_m() / style.hip_height_m)?;
     Ok(gait)
 }
 
@@ -242,7 +253,11 @@ fn running(args: &GenerateArgs, path: &Path, shape: &Shape) -> Result<Gait> {
     }
     eprintln!("notice: no --run-style, so the person runs as the people of {} do on average", path.display());
     let population = Population::new(&model, model.components(1.0));
-    Gait::typical(&model, &population, shape.hip_height_m(), &shape.offsets()).context("the speeds of running make no gait")
+    let typical = Gait::typical(&model, &population, shape.hip_height_m(), &shape.offsets());
+    let mut gait = typical.context("the speeds of running make no gait")?;
+    let (own, slowest_m_s) = (gait.clone(), gait.range_m_s().0);
+    args.manner.teach(&mut gait, || Some(own), slowest_m_s)?;
+    Ok(gait)
 }
 
 /// The motion with its feet planted where that is wanted.
@@ -252,8 +267,8 @@ fn planted(args: &GenerateArgs, name: &str, clip: Clip) -> Clip {
     }
     let planted = plant_feet(&clip);
     println!("{name}: {} contacts of feet planted", planted.contacts.iter().map(Vec::len).sum::<usize>());
-    if planted.unreached > 0 {
-        eprintln!("notice: {name}: in {} frames a leg is too short to stay on its foot", planted.unreached);
+    if planted.sliding > 0 {
+        eprintln!("notice: {name}: in {} contacts the foot still slides by more than 5 mm", planted.sliding);
     }
     planted.clip
 }

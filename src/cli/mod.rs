@@ -11,6 +11,7 @@ mod demo;
 mod disparity;
 mod generate;
 mod interrupt;
+mod manner;
 mod model;
 mod motions;
 mod observe;

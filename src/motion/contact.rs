@@ -15,10 +15,11 @@ use nalgebra::{UnitQuaternion, Vector3};
 
 use crate::body::{Clip, Joint};
 use crate::math::order::quantile;
-use crate::math::rotation::log;
 
 /// σ of the weights, metres. Smaller hands over from heel to ball within a frame, larger lets lifted heels count.
 const TOUCH_M: f64 = 0.006;
+/// A point this little over the lowest touches, metres.
+const TOUCHES_M: f64 = 0.002;
 /// Height over the floor, in hip heights: toes swing through little higher.
 const NEAR: f64 = 0.025;
 /// Speed of a standing sole: a part of the person's travel, and m/s on top. More takes feet that still land for standing.
@@ -79,9 +80,19 @@ impl FootTrack {
         (0..3).map(|i| (there[i] - here[i]) * (0.5 * (u[i] + v[i]))).sum()
     }
 
-    /// Turn about the vertical from `frame` to the next.
-    pub fn turn(&self, frame: usize) -> f64 {
-        log(&(self.world_from_foot[frame + 1] * self.world_from_foot[frame].inverse())).y
+    /// How far a point of the sole goes from where it touched first, while it is within [`TOUCHES_M`] of the lowest; the largest
+    /// over the frames of a contact, metres.
+    pub fn drift_m(&self, contact: Range<usize>) -> f64 {
+        let mut first: [Option<Vector3<f64>>; 3] = [None; 3];
+        let mut largest: f64 = 0.0;
+        for sole in &self.soles[contact] {
+            let lowest = sole.iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
+            for (first, p) in first.iter_mut().zip(sole) {
+                *first = (p.y < lowest + TOUCHES_M).then(|| first.unwrap_or(*p));
+                largest = largest.max(first.map_or(0.0, |f| (p - f).xz().norm()));
+            }
+        }
+        largest
     }
 
     /// Frames in which the foot stands.
@@ -151,21 +162,10 @@ mod tests {
         let poses = (0..=200).map(|k| Pose::rest(offsets[0] + Vector3::new(0.0, 0.0, way(f64::from(k) / 100.0)))).collect();
         let clip = Clip { fps: 100.0, poses, offsets, hip_height_m: shape.hip_height_m() };
         let foot = FootTrack::new(&clip, Joint::RAnkle);
-        assert!((foot.slide(50) - Vector3::new(0.0, 0.0, 5e-4)).norm() < 1e-12 && foot.turn(50) == 0.0);
+        assert!((foot.slide(50) - Vector3::new(0.0, 0.0, 5e-4)).norm() < 1e-12);
         let contacts = foot.contacts(&clip);
         assert!(contacts.len() == 1 && contacts[0] == (0..100), "{contacts:?}");
-    }
-
-    #[test]
-    fn a_turning_foot_turns_by_what_its_owner_turns() {
-        let shape = Shape::template(1.7);
-        let turned = |k: i32| {
-            let mut pose = Pose::rest(shape.offsets()[0]);
-            pose.world_from_root = crate::math::rotation::exp(&Vector3::new(0.0, 0.01 * f64::from(k), 0.0));
-            pose
-        };
-        let clip = Clip { fps: 60.0, poses: (0..3).map(turned).collect(), offsets: shape.offsets(), hip_height_m: shape.hip_height_m() };
-        assert!((FootTrack::new(&clip, Joint::LAnkle).turn(1) - 0.01).abs() < 1e-12);
+        assert!((foot.drift_m(0..100) - 0.05 * 0.99).abs() < 1e-12);
     }
 
     #[test]

@@ -12,6 +12,7 @@
 //! cycle its steps keep their length and come more often. The stand has straight legs and the cycle's mean for the rest.
 //!
 //! Changes are further cycles of the same channels that are added in any amount while it plays: an attribute, a caricature.
+//! Each costs 4 products more per channel, from however many examples it was learnt.
 //! Checked against the model's own postures, differences of speed, and the floor under a standing person.
 
 use nalgebra::{DVector, UnitQuaternion, Vector3};
@@ -19,7 +20,8 @@ use nalgebra::{DVector, UnitQuaternion, Vector3};
 use super::playback::{Synthesis, synthesize};
 use crate::body::{BALL_JOINTS, DOF, Joint, NODES, Pose, place};
 use crate::math::rotation::{exp, log};
-use crate::motion_model::{Activity, Cycle, Model, ROOT_CHANNELS, SAMPLES};
+use crate::motion_model::{Activity, Model, ROOT_CHANNELS, SAMPLES};
+use crate::style::space::{Blend, live};
 use crate::style::{Method, Population, Style, StyleError};
 
 /// Joint coordinates and root channels of one sample.
@@ -43,7 +45,16 @@ pub struct Gait {
     frequencies_hz: Vec<f64>,
     stand: [f64; CHANNELS],
     start_phase: f64,
-    changes: Vec<Vec<f64>>,
+    changes: Vec<Change>,
+}
+
+/// What can be mixed in while a gait plays: an attribute, a caricature.
+#[derive(Clone, Debug)]
+pub struct Change {
+    /// SAMPLES rows of [`CHANNELS`] (radians and hip heights) that are added.
+    pub rows: Vec<f64>,
+    /// Natural logarithm of how many times longer the stride becomes; fewer cycles per second then keep the speed.
+    pub log_stride: f64,
 }
 
 /// A posture against the carrier: see [`RootSample`](crate::motion_model::RootSample), the root's rotation as such.
@@ -131,10 +142,9 @@ impl Gait {
         self.start_phase
     }
 
-    /// Adds a cycle of differences (SAMPLES rows of [`CHANNELS`], radians and hip heights) that can be mixed in while it
-    /// plays; returns its place in the amounts. `None` where the length is another.
-    pub fn add_change(&mut self, change: Vec<f64>) -> Option<usize> {
-        (change.len() == SAMPLES * CHANNELS).then(|| {
+    /// Adds a change that can be mixed in while it plays; returns its place in the amounts. `None` where its length is another.
+    pub fn add_change(&mut self, change: Change) -> Option<usize> {
+        (change.rows.len() == SAMPLES * CHANNELS).then(|| {
             self.changes.push(change);
             self.changes.len() - 1
         })
@@ -144,8 +154,8 @@ impl Gait {
         self.changes.len()
     }
 
-    /// What separates this person from `other` at a speed, as a change for [`Gait::add_change`]: a caricature.
-    pub fn difference(&self, other: &Gait, speed_m_s: f64) -> Vec<f64> {
+    /// What separates this person from `other` at a speed: a caricature.
+    pub fn difference(&self, other: &Gait, speed_m_s: f64) -> Change {
         let cycle = |g: &Gait| g.mix(&g.speed_weights(speed_m_s));
         let mut own = cycle(self);
         for (sample, theirs) in cycle(other).chunks_exact(CHANNELS).enumerate() {
@@ -156,23 +166,20 @@ impl Gait {
             }
             (DOF..CHANNELS).for_each(|i| row[i] -= theirs[i]);
         }
-        own
+        Change { rows: own, log_stride: (other.frequency_hz(speed_m_s) / self.frequency_hz(speed_m_s)).ln() }
     }
 
-    /// What separates one cycle from another as a change for [`Gait::add_change`]: an attribute, made where labels are known.
-    pub fn change(&self, from: &Cycle, to: &Cycle) -> Vec<f64> {
-        let coordinates = |cycle: &Cycle| {
-            let mut rows = Vec::with_capacity(SAMPLES * CHANNELS);
-            for (joints, root) in cycle.joints.iter().zip(&cycle.root) {
-                for (mean, joint) in self.mean_rotations.iter().zip(joints) {
-                    rows.extend_from_slice(log(&(mean.inverse() * joint)).as_slice());
-                }
-                rows.extend_from_slice(root.rotation.as_slice());
-                rows.extend_from_slice(root.position.as_slice());
-            }
-            rows
-        };
-        coordinates(to).iter().zip(coordinates(from)).map(|(b, a)| b - a).collect()
+    /// What separates one motion of a space from another, see [`live::change`]: an attribute, made where labels are known.
+    pub fn change(&self, from: &Blend, to: &Blend) -> Change {
+        let stride = |b: &Blend| b.speed_m_s(1.0) * b.duration_s();
+        let ratio = stride(to) / stride(from);
+        let log_stride = if ratio.is_finite() && ratio > 0.0 { ratio.ln() } else { 0.0 };
+        Change { rows: live::change(from, to, &self.mean_rotations, SAMPLES), log_stride }
+    }
+
+    /// Numbers that the gait holds; a posture reads 16 rows of them and 4 of every change.
+    pub fn numbers(&self) -> usize {
+        self.cycles.iter().chain(self.changes.iter().map(|c| &c.rows)).map(Vec::len).sum()
     }
 
     /// Cycles per second at a speed.
@@ -185,6 +192,11 @@ impl Gait {
         inside(speed_m_s) * (speed_m_s / fastest).max(1.0)
     }
 
+    /// What the changes in the given amounts make of the cycles per second: strides e^(Σ amount · log_stride) times as long.
+    pub fn cadence_factor(&self, amounts: impl Iterator<Item = f64>) -> f64 {
+        self.changes.iter().zip(amounts).map(|(change, amount)| -amount * change.log_stride).sum::<f64>().exp()
+    }
+
     /// Posture at a speed and phase, with the changes in the given amounts (missing ones are zero).
     pub fn posture(&self, speed_m_s: f64, phase: f64, amounts: impl Iterator<Item = f64>) -> Posture {
         let samples = phase_weights(phase);
@@ -193,7 +205,7 @@ impl Gait {
             samples.iter().for_each(|(j, u)| add_row(&mut c, &self.cycles[k], *j, w * u));
         }
         for (change, amount) in self.changes.iter().zip(amounts).filter(|(_, amount)| *amount != 0.0) {
-            samples.iter().for_each(|(j, u)| add_row(&mut c, change, *j, amount * u));
+            samples.iter().for_each(|(j, u)| add_row(&mut c, &change.rows, *j, amount * u));
         }
         let r = (speed_m_s / self.slowest_m_s).clamp(0.0, 1.0);
         let a = r * (2.0 - r);

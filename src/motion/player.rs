@@ -210,11 +210,10 @@ impl<'a> Player<'a> {
     }
 
     fn frequency_hz(&self) -> f64 {
-        let slow = |v: f64| self.gaits.slow.frequency_hz(v);
-        let v = self.speed.value;
+        let of = |gait: &Gait| gait.frequency_hz(self.speed.value) * gait.cadence_factor(self.amounts.iter().map(|a| a.value));
         match (&self.gaits.fast, self.running()) {
-            (Some(fast), share) if share > 0.0 => slow(v).powf(1.0 - share) * fast.gait.frequency_hz(v).powf(share),
-            _ => slow(v),
+            (Some(fast), share) if share > 0.0 => of(&self.gaits.slow).powf(1.0 - share) * of(&fast.gait).powf(share),
+            _ => of(&self.gaits.slow),
         }
     }
 

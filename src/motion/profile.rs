@@ -1,9 +1,9 @@
-//! Speed and bend of the path over time, and the clip of a person who follows them.
+//! Speed, bend of the path and manner over time, and the clip of a person who follows them.
 //!
 //! Speeds run straight between the given times. The player follows a ramp late by a fixed time; it is given what comes that
 //! much later, so ramps are followed without delay and only their corners are rounded.
 
-use super::player::{Gaits, Player, RESPONSE_S};
+use super::player::{Eased, Gaits, Player, RESPONSE_S};
 use crate::body::{Clip, NODES, Pose};
 use nalgebra::Vector3;
 
@@ -19,10 +19,38 @@ pub struct Waypoint {
     pub curvature: f64,
 }
 
-/// Speed and curvature over time.
+/// Speed and curvature over time, and the amounts of changes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Profile {
     waypoints: Vec<Waypoint>,
+    amounts: Vec<Course>,
+}
+
+/// A number over time, straight between its points, the ends held.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Course(Vec<(f64, f64)>);
+
+impl Course {
+    /// From (seconds, value) in order of time, at least one.
+    pub fn new(points: Vec<(f64, f64)>) -> Result<Course, ProfileError> {
+        if let Some(w) = points.windows(2).find(|w| w[1].0 <= w[0].0) {
+            return Err(ProfileError::Backwards(w[1].0, w[0].0));
+        }
+        if points.is_empty() || points.iter().any(|p| !(p.0.is_finite() && p.1.is_finite())) {
+            return Err(ProfileError::Empty);
+        }
+        Ok(Course(points))
+    }
+
+    /// The value at a time.
+    pub fn at(&self, time_s: f64) -> f64 {
+        let after = self.0.partition_point(|p| p.0 <= time_s);
+        if after == 0 || after == self.0.len() {
+            return self.0[after.saturating_sub(1)].1;
+        }
+        let (a, b) = (self.0[after - 1], self.0[after]);
+        a.1 + (b.1 - a.1) * (time_s - a.0) / (b.0 - a.0)
+    }
 }
 
 #[derive(Debug, thiserror::Error, PartialEq)]
@@ -35,6 +63,10 @@ pub enum ProfileError {
     Speed { time_s: f64, speed_m_s: f64 },
     #[error("the bend at {time_s} s is not a finite number")]
     Bend { time_s: f64 },
+    #[error("times must increase, and {0} s follows {1} s")]
+    Backwards(f64, f64),
+    #[error("a value over time needs at least one finite number")]
+    Empty,
 }
 
 /// Where the player was in one frame of a clip.
@@ -71,7 +103,12 @@ impl Profile {
             }
             before = w.time_s;
         }
-        Ok(Profile { waypoints })
+        Ok(Profile { waypoints, amounts: Vec::new() })
+    }
+
+    /// With amounts of the gaits' changes over time, in their order (see [`Gait::add_change`](super::Gait::add_change)).
+    pub fn with_amounts(self, amounts: Vec<Course>) -> Profile {
+        Profile { amounts, ..self }
     }
 
     /// One speed and bend for `seconds`.
@@ -110,12 +147,17 @@ impl Profile {
 pub fn follow(gaits: &Gaits, profile: &Profile, offsets: &[Vector3<f64>; NODES], fps: f64) -> (Clip, Vec<Step>) {
     let (speed, curvature) = profile.at(0.0);
     let mut player = Player::new(gaits, speed, curvature);
+    for (amount, course) in player.amounts.iter_mut().zip(&profile.amounts) {
+        *amount = Eased::at(course.at(0.0));
+    }
     let frames = (profile.seconds() * fps).round() as usize + 1;
     let (mut poses, mut steps): (Vec<Pose>, Vec<Step>) = (Vec::with_capacity(frames), Vec::with_capacity(frames));
     for frame in 0..frames {
         let time_s = frame as f64 / fps;
         if frame > 0 {
-            (player.target_speed_m_s, player.target_curvature) = profile.at(time_s - 0.5 / fps + DELAY_S);
+            let soon_s = time_s - 0.5 / fps + DELAY_S;
+            (player.target_speed_m_s, player.target_curvature) = profile.at(soon_s);
+            player.amounts.iter_mut().zip(&profile.amounts).for_each(|(amount, course)| amount.target = course.at(soon_s));
             player.next(1.0 / fps);
         }
         poses.push(player.pose());

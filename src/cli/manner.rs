@@ -1,0 +1,120 @@
+//! Attributes and caricature of a generated motion, steady or over time.
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use muybridge::io::space_npz::read_space;
+use muybridge::motion::{Change, Course, Gait};
+use muybridge::style::space::attributes::{direction, spread};
+use muybridge::style::space::{Method, Space};
+
+use super::motions::file_name;
+
+#[derive(Args)]
+pub struct MannerArgs {
+    /// Space of `blend build` that knows the attributes
+    #[arg(long, value_name = "SPACE", requires = "attribute")]
+    space: Option<PathBuf>,
+    /// More or less of an attribute, in standard deviations of its labels, the others held: NAME=AMOUNT, or over time
+    /// NAME=SECONDS:AMOUNT,SECONDS:AMOUNT; repeat for several
+    #[arg(long, value_name = "NAME=AMOUNT", requires = "space", allow_hyphen_values = true)]
+    attribute: Vec<Knob>,
+    /// What is one's own against the model's people, exaggerated: 1 is the original, 0 the mean; DEGREE, or over time
+    /// SECONDS:DEGREE,SECONDS:DEGREE
+    #[arg(long, value_name = "DEGREE", allow_hyphen_values = true)]
+    caricature: Option<Amount>,
+}
+
+/// An attribute and how much of it.
+#[derive(Clone)]
+struct Knob {
+    name: String,
+    amount: Amount,
+}
+
+#[derive(Clone)]
+struct Amount(Vec<(f64, f64)>);
+
+impl FromStr for Knob {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Knob, String> {
+        let (name, amount) = text.rsplit_once('=').ok_or("must be NAME=AMOUNT or NAME=SECONDS:AMOUNT,...")?;
+        Ok(Knob { name: name.trim().into(), amount: amount.parse()? })
+    }
+}
+
+impl FromStr for Amount {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Amount, String> {
+        let number = |t: &str| t.trim().parse::<f64>().map_err(|_| format!("`{t}` in `{text}` is not a number"));
+        let point = |part: &str| match part.split_once(':') {
+            Some((time_s, value)) => Ok((number(time_s.trim_end_matches('s'))?, number(value)?)),
+            None => Ok((0.0, number(part)?)),
+        };
+        let points = text.split(',').map(point).collect::<Result<Vec<_>, String>>()?;
+        Course::new(points.clone()).map_err(|e| e.to_string())?;
+        Ok(Amount(points))
+    }
+}
+
+impl MannerArgs {
+    pub fn is_plain(&self) -> bool {
+        self.attribute.is_empty() && self.caricature.is_none()
+    }
+
+    /// Amounts over time, in the order in which [`MannerArgs::teach`] adds the changes.
+    pub fn courses(&self) -> Result<Vec<Course>> {
+        let beyond = |degree: &Amount| degree.0.iter().map(|(t, d)| (*t, d - 1.0)).collect();
+        let attributes = self.attribute.iter().map(|k| k.amount.0.clone());
+        Ok(attributes.chain(self.caricature.iter().map(beyond)).map(Course::new).collect::<Result<_, _>>()?)
+    }
+
+    /// Adds the changes to a gait; `typical` is that of the model's people on average, and `speed_m_s` where the two are compared.
+    pub fn teach(&self, gait: &mut Gait, typical: impl FnOnce() -> Option<Gait>, speed_m_s: f64) -> Result<()> {
+        let mut changes = self.attributes(gait)?;
+        if self.caricature.is_some() {
+            changes.push(gait.difference(&typical().context("the model's people make no gait")?, speed_m_s));
+        }
+        for change in changes {
+            gait.add_change(change).context("a change of another length than the gait's")?;
+        }
+        Ok(())
+    }
+
+    /// One standard deviation more of every attribute, the others held.
+    fn attributes(&self, gait: &Gait) -> Result<Vec<Change>> {
+        let Some(path) = &self.space else { return Ok(Vec::new()) };
+        let space = read_space(path)?;
+        if !space.layout.cyclic {
+            bail!("{} is a space of whole motions; attributes of gaits need one of cycles", file_name(path));
+        }
+        let all: Vec<usize> = (0..space.attributes.len()).collect();
+        let of = |knob: &Knob| unit(&space, &knob.name, &all, gait);
+        self.attribute.iter().map(of).collect()
+    }
+}
+
+fn unit(space: &Space, name: &str, keep: &[usize], gait: &Gait) -> Result<Change> {
+    let attribute = space.attribute(name)?;
+    let deviation = spread(&space.attributes[attribute]).1;
+    let vector = direction(space, attribute, Method::Joint, keep)?;
+    let mean = space.mean();
+    Ok(gait.change(&space.play(&mean), &space.play(&mean.plus(&vector, deviation, deviation))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn amounts_are_numbers_or_courses() {
+        let knob: Knob = "hand-height=-1.5".parse().unwrap();
+        assert_eq!((knob.name.as_str(), knob.amount.0), ("hand-height", vec![(0.0, -1.5)]));
+        let course: Amount = "1:0, 4s:2".parse().unwrap();
+        assert_eq!(course.0, [(1.0, 0.0), (4.0, 2.0)]);
+        let said = |text: &str| text.parse::<Knob>().err().unwrap();
+        assert!(said("energy").contains("NAME=AMOUNT") && said("energy=much").contains("`much` in `much` is not a number"));
+        assert!(said("energy=0:1,0:2").contains("times must increase") && said("energy=nan").contains("finite"));
+    }
+}
