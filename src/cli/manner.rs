@@ -7,7 +7,7 @@ use clap::Args;
 use muybridge::io::space_npz::read_space;
 use muybridge::motion::{Change, Course, Gait};
 use muybridge::style::space::attributes::{direction, spread};
-use muybridge::style::space::{Method, Space};
+use muybridge::style::space::{Method, Space, Vectors};
 
 use super::motions::file_name;
 
@@ -36,6 +36,25 @@ struct Knob {
 #[derive(Clone)]
 struct Amount(Vec<(f64, f64)>);
 
+impl Amount {
+    /// The highest value above zero and the lowest below it.
+    fn sides(&self) -> impl Iterator<Item = f64> {
+        let values = || self.0.iter().map(|p| p.1);
+        [values().fold(0.0, f64::max), values().fold(0.0, f64::min)].into_iter().filter(|side| *side != 0.0)
+    }
+}
+
+/// The same course with a point where it crosses zero, so that its two sides are straight too.
+fn with_zeros(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let mut all = points[..1].to_vec();
+    for w in points.windows(2) {
+        let ((t, v), (u, w)) = (w[0], w[1]);
+        all.extend((v * w < 0.0).then(|| (t + (u - t) * v / (v - w), 0.0)));
+        all.push((u, w));
+    }
+    all
+}
+
 impl FromStr for Knob {
     type Err = String;
     fn from_str(text: &str) -> Result<Knob, String> {
@@ -54,7 +73,7 @@ impl FromStr for Amount {
         };
         let points = text.split(',').map(point).collect::<Result<Vec<_>, String>>()?;
         Course::new(points.clone()).map_err(|e| e.to_string())?;
-        Ok(Amount(points))
+        Ok(Amount(with_zeros(&points)))
     }
 }
 
@@ -65,9 +84,10 @@ impl MannerArgs {
 
     /// Amounts over time, in the order in which [`MannerArgs::teach`] adds the changes.
     pub fn courses(&self) -> Result<Vec<Course>> {
-        let beyond = |degree: &Amount| degree.0.iter().map(|(t, d)| (*t, d - 1.0)).collect();
-        let attributes = self.attribute.iter().map(|k| k.amount.0.clone());
-        Ok(attributes.chain(self.caricature.iter().map(beyond)).map(Course::new).collect::<Result<_, _>>()?)
+        let scaled = |a: &Amount, f: &dyn Fn(f64) -> f64| a.0.iter().map(|(t, v)| (*t, f(*v))).collect();
+        let sides = |knob: &Knob| knob.amount.sides().map(|side| scaled(&knob.amount, &|v| (v / side).max(0.0))).collect::<Vec<_>>();
+        let caricature = self.caricature.iter().map(|degree| scaled(degree, &|v| v - 1.0));
+        Ok(self.attribute.iter().flat_map(sides).chain(caricature).map(Course::new).collect::<Result<_, _>>()?)
     }
 
     /// Adds the changes to a gait; `typical` is that of the model's people on average, and `speed_m_s` where the two are compared.
@@ -82,7 +102,99 @@ impl MannerArgs {
         Ok(())
     }
 
-    /// One standard deviation more of every attribute, the others held.
+    /// The most and the least wanted of every attribute, the others held: exactly what `blend attribute` makes.
+    fn attributes(&self, gait: &Gait) -> Result<Vec<Change>> {
+        let Some(path) = &self.space else { return Ok(Vec::new()) };
+        let space = read_space(path)?;
+        if !space.layout.cyclic {
+            bail!("{} is a space of whole motions; attributes of gaits need one of cycles", file_name(path));
+        }
+        let mut changes = Vec::new();
+        for knob in &self.attribute {
+            let vector = unit(&space, &knob.name)?;
+            let at = |amount: f64| space.play(&space.mean().plus(&vector, amount, amount));
+            changes.extend(knob.amount.sides().map(|side| gait.change(&at(0.0), &at(side))));
+        }
+        Ok(changes)
+    }
+}
+
+/// One standard deviation more of an attribute, the others held.
+fn unit(space: &Space, name: &str) -> Result<Vectors> {
+    let attribute = space.attribute(name)?;
+    let all: Vec<usize> = (0..space.attributes.len()).collect();
+    let vector = direction(space, attribute, Method::Joint, &all)?;
+    let deviation = spread(&space.attributes[attribute]).1;
+    Ok(Vectors { shape: vector.shape * deviation, timing: vector.timing * deviation })
+}
+
+impl Amount {
+    /// The value farthest from zero; 1 where all are zero.
+    fn farthest(&self) -> f64 {
+        let farthest = self.0.iter().map(|p| p.1).fold(0.0, |far: f64, v| if v.abs() > far.abs() { v } else { far });
+        if farthest == 0.0 { 1.0 } else { farthest }
+    }
+}
+
+/// The same course with a point where it crosses zero, so that its two sides are straight too.
+fn with_zeros(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let mut all = points[..1].to_vec();
+    for w in points.windows(2) {
+        let ((t, v), (u, w)) = (w[0], w[1]);
+        all.extend((v * w < 0.0).then(|| (t + (u - t) * v / (v - w), 0.0)));
+        all.push((u, w));
+    }
+    all
+}
+
+impl FromStr for Knob {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Knob, String> {
+        let (name, amount) = text.rsplit_once('=').ok_or("must be NAME=AMOUNT or NAME=SECONDS:AMOUNT,...")?;
+        Ok(Knob { name: name.trim().into(), amount: amount.parse()? })
+    }
+}
+
+impl FromStr for Amount {
+    type Err = String;
+    fn from_str(text: &str) -> Result<Amount, String> {
+        let number = |t: &str| t.trim().parse::<f64>().map_err(|_| format!("`{t}` in `{text}` is not a number"));
+        let point = |part: &str| match part.split_once(':') {
+            Some((time_s, value)) => Ok((number(time_s.trim_end_matches('s'))?, number(value)?)),
+            None => Ok((0.0, number(part)?)),
+        };
+        let points = text.split(',').map(point).collect::<Result<Vec<_>, String>>()?;
+        Course::new(points.clone()).map_err(|e| e.to_string())?;
+        Ok(Amount(with_zeros(&points)))
+    }
+}
+
+impl MannerArgs {
+    pub fn is_plain(&self) -> bool {
+        self.attribute.is_empty() && self.caricature.is_none()
+    }
+
+    /// Amounts over time, in the order in which [`MannerArgs::teach`] adds the changes.
+    pub fn courses(&self) -> Result<Vec<Course>> {
+        let scaled = |a: &Amount, f: &dyn Fn(f64) -> f64| a.0.iter().map(|(t, v)| (*t, f(*v))).collect();
+        let sides = |knob: &Knob| knob.amount.sides().map(|side| scaled(&knob.amount, &|v| (v / side).max(0.0))).collect::<Vec<_>>();
+        let caricature = self.caricature.iter().map(|degree| scaled(degree, &|v| v - 1.0));
+        Ok(self.attribute.iter().flat_map(sides).chain(caricature).map(Course::new).collect::<Result<_, _>>()?)
+    }
+
+    /// Adds the changes to a gait; `typical` is that of the model's people on average, and `speed_m_s` where the two are compared.
+    pub fn teach(&self, gait: &mut Gait, typical: impl FnOnce() -> Option<Gait>, speed_m_s: f64) -> Result<()> {
+        let mut changes = self.attributes(gait)?;
+        if self.caricature.is_some() {
+            changes.push(gait.difference(&typical().context("the model's people make no gait")?, speed_m_s));
+        }
+        for change in changes {
+            gait.add_change(change).context("a change of another length than the gait's")?;
+        }
+        Ok(())
+    }
+
+    /// The farthest wanted of every attribute, the others held: exactly what `blend attribute` makes.
     fn attributes(&self, gait: &Gait) -> Result<Vec<Change>> {
         let Some(path) = &self.space else { return Ok(Vec::new()) };
         let space = read_space(path)?;
@@ -90,17 +202,16 @@ impl MannerArgs {
             bail!("{} is a space of whole motions; attributes of gaits need one of cycles", file_name(path));
         }
         let all: Vec<usize> = (0..space.attributes.len()).collect();
-        let of = |knob: &Knob| unit(&space, &knob.name, &all, gait);
-        self.attribute.iter().map(of).collect()
+        self.attribute.iter().map(|knob| farthest(&space, knob, &all, gait)).collect()
     }
 }
 
-fn unit(space: &Space, name: &str, keep: &[usize], gait: &Gait) -> Result<Change> {
-    let attribute = space.attribute(name)?;
-    let deviation = spread(&space.attributes[attribute]).1;
+fn farthest(space: &Space, knob: &Knob, keep: &[usize], gait: &Gait) -> Result<Change> {
+    let attribute = space.attribute(&knob.name)?;
+    let amount = knob.amount.farthest() * spread(&space.attributes[attribute]).1;
     let vector = direction(space, attribute, Method::Joint, keep)?;
     let mean = space.mean();
-    Ok(gait.change(&space.play(&mean), &space.play(&mean.plus(&vector, deviation, deviation))))
+    Ok(gait.change(&space.play(&mean), &space.play(&mean.plus(&vector, amount, amount))))
 }
 
 #[cfg(test)]
@@ -113,6 +224,13 @@ mod tests {
         assert_eq!((knob.name.as_str(), knob.amount.0), ("hand-height", vec![(0.0, -1.5)]));
         let course: Amount = "1:0, 4s:2".parse().unwrap();
         assert_eq!(course.0, [(1.0, 0.0), (4.0, 2.0)]);
+        let sides = |text: &str| text.parse::<Amount>().unwrap().sides().collect::<Vec<_>>();
+        assert_eq!([sides("1:0.5,2:-2,3:1"), sides("0"), sides("-0.3")], [vec![1.0, -2.0], vec![], vec![-0.3]]);
+        let attribute = vec!["energy=1:0.5,2:-2,3:1".parse().unwrap()];
+        let courses = MannerArgs { space: None, attribute, caricature: "1.3".parse().ok() }.courses().unwrap();
+        assert_eq!([1.0, 1.2, 2.0, 3.0].map(|t| courses[0].at(t)), [0.5, 0.0, 0.0, 1.0]);
+        assert_eq!([1.0, 1.2, 2.0, 3.0].map(|t| courses[1].at(t)), [0.0, 0.0, 1.0, 0.0]);
+        assert!(courses.len() == 3 && (courses[2].at(7.0) - 0.3).abs() < 1e-12);
         let said = |text: &str| text.parse::<Knob>().err().unwrap();
         assert!(said("energy").contains("NAME=AMOUNT") && said("energy=much").contains("`much` in `much` is not a number"));
         assert!(said("energy=0:1,0:2").contains("times must increase") && said("energy=nan").contains("finite"));

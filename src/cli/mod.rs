@@ -56,7 +56,7 @@ enum Command {
     #[command(subcommand)]
     Model(model::ModelCommand),
     /// The same person at other speeds or jump lengths
-    Generate(generate::GenerateArgs),
+    Generate(Box<generate::GenerateArgs>),
     /// Motions in a vector space: mixed, with less or more of an attribute, caricatured, varied
     #[command(subcommand)]
     Blend(blend::BlendCommand),
@@ -103,7 +103,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Animal(command) => animal::run(&command),
         Command::Bench(command) => bench::run(&command),
         Command::Model(command) => model::run(command),
-        Command::Generate(args) => generate::run(args),
+        Command::Generate(args) => generate::run(*args),
         Command::Blend(command) => blend::run(command),
     }
 }
