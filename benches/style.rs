@@ -3,6 +3,7 @@
 //! The peer is `peers/pca_sklearn.py`, full PCA of the same 324 x 7800 matrix, all threads that it wants; PYTHON names the
 //! interpreter with numpy and scikit-learn (`python3` without it). Where it does not run, that is said.
 //! Postures run on one thread, from weights and a phase to the 26 joint rotations and the root, phases in no order.
+//! The player walks in real time without and with two attributes, learnt from few and from many examples.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -10,7 +11,12 @@ use std::process::Command;
 use std::time::Instant;
 
 use muybridge::math::pca::pca;
+use muybridge::body::Shape;
+use muybridge::motion::{Gait, Gaits, Player};
 use muybridge::motion_model::{Activity, Model, synthetic};
+use muybridge::style::Population;
+use muybridge::style::space::attributes::{direction, spread};
+use muybridge::style::space::{Example, Method, Options, Space};
 use nalgebra::DMatrix;
 
 const ROUNDS: usize = 7;
@@ -34,6 +40,43 @@ fn main() {
         let each_ns = 1e6 * best / POSTURES as f64;
         println!("| {} | {each_ns:.0} | {:.2} million |", used.len(), 1e3 / each_ns);
     }
+    players(&model);
+}
+
+/// Time of `Player::next` by the examples that its attributes were learnt from.
+fn players(model: &Model) {
+    let shape = Shape::template(1.75);
+    let population = Population::new(model, 10);
+    let plain = Gait::typical(model, &population, shape.hip_height_m(), &shape.offsets()).expect("walking has speeds");
+    let alone_ns = next_ns(&Gaits::one(plain.clone()));
+    println!("\n| examples | ns per next(dt) | against no attributes |\n|---|---|---|\n| none | {alone_ns:.0} | 1 |");
+    for people in [2, 32] {
+        let mut gait = plain.clone();
+        let examples = teach(&mut gait, people);
+        let each_ns = next_ns(&Gaits::one(gait));
+        println!("| {examples} | {each_ns:.0} | {:.2} |", each_ns / alone_ns);
+    }
+}
+
+/// Adds both measured attributes of a space of synthetic walkers; returns the number of its examples.
+fn teach(gait: &mut Gait, people: u64) -> usize {
+    let cycles = (1..=people).flat_map(|seed| [0.9, 1.5].map(|v| (seed, v, synthetic::subject(Activity::Walking, seed).cycle(v, 0))));
+    let examples: Vec<Example> = cycles.map(|(seed, v, cycle)| Example::of_cycle(&format!("{seed} {v}"), &cycle)).collect();
+    let space = Space::build(&examples, &Options { activity: Some(Activity::Walking), ..Options::default() }).expect("walks");
+    let mean = space.mean();
+    for (k, attribute) in space.attributes.iter().enumerate() {
+        let (vector, deviation) = (direction(&space, k, Method::Joint, &[0, 1]).expect("measured"), spread(attribute).1);
+        let change = gait.change(&space.play(&mean), &space.play(&mean.plus(&vector, deviation, deviation)));
+        gait.add_change(change).expect("a walking cycle");
+    }
+    examples.len()
+}
+
+fn next_ns(gaits: &Gaits) -> f64 {
+    let mut player = Player::new(gaits, 1.3, 0.0);
+    player.amounts.iter_mut().for_each(|a| a.target = 1.0);
+    let best = (0..ROUNDS).map(|_| timed_ms(|| (0..POSTURES).for_each(|_| drop(black_box(player.next(0.01)))))).fold(f64::MAX, f64::min);
+    1e6 * best / POSTURES as f64
 }
 
 fn postures(model: &Model, weights: &[f64]) -> usize {

@@ -277,6 +277,51 @@ fn the_command_builds_mixes_and_changes() {
     assert_eq!(std::fs::read_to_string(dir.path().join("info/members.csv")).unwrap().lines().count(), 1 + space_members(&said));
 }
 
+/// Mean height of the right wrist (hip heights) and mean speed of all joints against the root (m/s) in a written motion.
+fn read_off(file: &Path) -> [f64; 2] {
+    let clip = read_clip(file).unwrap().clip;
+    let placed: Vec<_> = clip.poses.iter().map(|p| clip.place(p).positions).collect();
+    let hand = placed.iter().map(|p| p[Joint::RWrist as usize].y).sum::<f64>() / (placed.len() as f64 * clip.hip_height_m);
+    let speeds = placed.windows(2).flat_map(|w| (1..w[0].len()).map(|k| ((w[1][k] - w[1][0]) - (w[0][k] - w[0][0])).norm() * clip.fps));
+    [hand, speeds.sum::<f64>() / ((placed.len() - 1) * (placed[0].len() - 1)) as f64]
+}
+
+#[test]
+fn two_attributes_of_the_stylised_set_move_one_at_a_time() {
+    let Some(m21) = mocap("stylised-cmu-m21") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let (space, parts) = (at("space.npz"), at("parts.csv"));
+    // The parts of the set in which somebody walks a whole cycle.
+    let rows = [("content/walk", ","), ("content/female-walk", ","), ("style/ZOMBIE", "0,2.6"), ("style/DEPRESSED", "5.2,8.5")];
+    let row = |(file, part): &(&str, &str)| format!("{},walking,{part}\n", m21.join(file).with_extension("bvh").display());
+    std::fs::write(&parts, format!("file,activity,start_s,end_s\n{}", rows.iter().map(row).collect::<String>())).unwrap();
+    let (done, _, error) = run(&["blend", "build", &at(""), "--manifest", &parts, "-o", &space]);
+    assert!(done, "{error}");
+    let members = "walk=1,female-walk=1,ZOMBIE=1,DEPRESSED=1";
+    let (done, _, error) = run(&["blend", "mix", &space, "--shape", members, "-o", &at("members")]);
+    assert!(done, "{error}");
+    let own = members.split(',').map(|m| read_off(&dir.path().join(format!("members/part_{}.bvh", m.trim_end_matches("=1")))));
+    let own: Vec<[f64; 2]> = own.collect();
+    let spread = |k: usize| {
+        let mean = own.iter().map(|m| m[k]).sum::<f64>() / own.len() as f64;
+        (mean, (own.iter().map(|m| (m[k] - mean).powi(2)).sum::<f64>() / own.len() as f64).sqrt())
+    };
+    println!("| more of | steps of 0.5 s.d. | right hand, hip heights | mean joint speed, m/s |\n|---|---|---|---|");
+    for (moved, name) in ["hand-height", "energy"].into_iter().enumerate() {
+        let out = at(name);
+        let (done, _, error) = run(&["blend", "attribute", &space, name, "--by=-1,-0.5,0,0.5,1", "-o", &out]);
+        assert!(done, "{error}");
+        let steps = ["-1", "-0.5", "+0", "+0.5", "+1"].map(|by| read_off(&Path::new(&out).join(format!("{name}_{by}.bvh"))));
+        println!("| {name} | -1 to 1 | {:.3?} | {:.3?} |", steps.map(|s| s[0]), steps.map(|s| s[1]));
+        let ((_, deviation), (mean, other)) = (spread(moved), spread(1 - moved));
+        assert!(steps.windows(2).all(|w| w[1][moved] > w[0][moved] + 0.1 * deviation), "{steps:?} {deviation}");
+        assert!(steps[4][moved] - steps[0][moved] > deviation);
+        assert!(steps.iter().all(|s| (s[1 - moved] - mean).abs() < other), "{steps:?} {mean} {other}");
+    }
+    println!("| the four recordings | mean and s.d. | {:.3?} | {:.3?} |", spread(0), spread(1));
+}
+
 fn space_members(said: &str) -> usize {
     said.split(": ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap()
 }

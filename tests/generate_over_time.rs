@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
+use muybridge::body::{Joint, Pose};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
-use muybridge::io::{read_clip, style_json};
-use muybridge::motion::synthesize;
+use muybridge::io::{bvh, read_clip, style_json};
+use muybridge::motion::{Length, play_cycle, synthesize};
 use muybridge::motion_model::{Activity, Cycle, Detail, Label, Model, database, segment, synthetic};
 use muybridge::style::{Method, Metric, Population, Style};
 use nalgebra::DVector;
@@ -93,14 +94,80 @@ fn a_bend_turns_by_its_way_over_its_radius() {
     assert!(off < 0.08, "{off}");
 }
 
+/// A space of synthetic walkers.
+fn walkers_space(folder: &Path) -> String {
+    let space = path(folder, "space.npz");
+    let files: Vec<String> = (1..5u64)
+        .map(|seed| {
+            let subject = synthetic::subject(Activity::Walking, seed);
+            let cycle = subject.cycle(0.8 + 0.2 * seed as f64, 0);
+            let clip = play_cycle(&cycle, &subject.shape().offsets(), 100.0, Length::Cycles(4));
+            let file = path(folder, &format!("w{seed}.bvh"));
+            bvh::write_clip(Path::new(&file), &clip, None).unwrap();
+            file
+        })
+        .collect();
+    let build: Vec<&str> = ["blend", "build", "-o", &space].into_iter().chain(files.iter().map(String::as_str)).collect();
+    assert!(run(&build).0);
+    space
+}
+
+/// Height of the right wrist over that of the hip joints in every frame of a file.
+fn hand_heights(bvh: &Path) -> Vec<f64> {
+    let clip = read_clip(bvh).unwrap().clip;
+    clip.poses.iter().map(|p| clip.place(p).position(Joint::RWrist).y / clip.hip_height_m).collect()
+}
+
+#[test]
+fn attributes_and_caricatures_are_turned_while_it_walks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (walking, style) = model_and_style(dir.path(), Activity::Walking, 1.2);
+    let space = walkers_space(dir.path());
+    let generate = |name: &str, options: &[&str]| {
+        let out = path(dir.path(), name);
+        let (done, _, error) = run(&[&["generate", "--model", &walking, "--style", &style, "-o", &out][..], options].concat());
+        (done, error, PathBuf::from(out))
+    };
+    let mean = |h: &[f64]| h.iter().sum::<f64>() / h.len() as f64;
+    let steady = ["-1.5", "0", "0.75", "1.5"].map(|amount| {
+        let attribute = format!("hand-height={amount}");
+        let (done, error, out) = generate(amount, &["--at", "1.2", "--space", &space, "--attribute", &attribute]);
+        assert!(done, "{error}");
+        mean(&hand_heights(&out.join("walking_1.20.bvh")))
+    });
+    println!("right hand at {steady:.3?} hip heights");
+    assert!(steady.windows(2).all(|w| w[1] > w[0] + 0.002), "{steady:?}");
+    let course = ["--profile", "0:1.2,8:1.2", "--space", &space, "--attribute", "hand-height=2:-1.5,5:1.5", "--plant-feet"];
+    let (done, error, out) = generate("course", &course);
+    assert!(done, "{error}");
+    let heights = hand_heights(&out.join("profile.bvh"));
+    let (before, after) = (mean(&heights[..100]), mean(&heights[380..]));
+    assert!((before - steady[0]).abs() < 0.25 * (steady[3] - steady[0]), "{before} {steady:?}");
+    assert!((after - steady[3]).abs() < 0.25 * (steady[3] - steady[0]), "{after} {steady:?}");
+    // At the same instant of the cycle, twice one's own is as far on the one side as nothing of it on the other.
+    let first = |name: &str, options: &[&str]| {
+        let (done, error, out) = generate(name, &[&["--at", "1.2"][..], options].concat());
+        assert!(done, "{error}");
+        read_clip(&out.join("walking_1.20.bvh")).unwrap().clip.poses.remove(0)
+    };
+    let own = first("own", &[]);
+    let [mean, once, twice] = ["0", "1", "2"].map(|degree| first(&format!("car{degree}"), &["--caricature", degree]));
+    let apart = |p: &Pose| p.joints.iter().zip(&own.joints).map(|(a, b)| a.angle_to(b).powi(2)).sum::<f64>().sqrt().to_degrees();
+    println!("from the original {:.2}, {:.2}, {:.2} degrees", apart(&mean), apart(&once), apart(&twice));
+    assert!(apart(&once) < 0.1 && apart(&mean) > 1.0 && (apart(&twice) / apart(&mean) - 1.0).abs() < 0.1);
+    let (done, error, out) = generate("none", &["--at", "1.2", "--space", &space, "--attribute", "grace=1"]);
+    assert!(!done && error.contains("no attribute `grace`; it has hand-height, energy") && !out.exists(), "{error}");
+}
+
 #[test]
 fn what_cannot_be_followed_is_one_sentence() {
     let dir = tempfile::tempdir().unwrap();
     let (walking, style) = model_and_style(dir.path(), Activity::Walking, 1.2);
     let (jumping, jump) = model_and_style(dir.path(), Activity::Jumping, 0.8);
     let out = path(dir.path(), "none");
-    let cases: [(&[&str], &str); 4] = [
+    let cases: [(&[&str], &str); 5] = [
         (&["--model", &jumping, "--style", &jump, "--profile", "0:0,1:1"], "holds jumps"),
+        (&["--model", &jumping, "--style", &jump, "--at", "0.8", "--caricature", "2"], "holds jumps"),
         (&["--model", &walking, "--style", &style, "--profile", "0:0,1:1", "--run-model", &walking], "not of running"),
         (&["--model", &walking, "--style", &style, "--profile", "0:0,0:1"], "must increase"),
         (&["--model", &walking, "--style", &style, "--at", "1", "--turn-radius", "0.1"], "radius of 0.5 m or more"),

@@ -39,7 +39,10 @@ pub fn plant_feet(clip: &Clip) -> Planted {
     let tracks = LEGS.map(|leg| FootTrack::new(clip, leg[2]));
     let contacts = tracks.each_ref().map(|foot| foot.contacts(clip));
     let footing = Footing::new(clip, &tracks, &contacts);
-    let (changes, _) = minimise(&footing, vec![[0.0; UNKNOWNS]; clip.poses.len()], &SOLVE);
+    let mut changes = vec![[0.0; UNKNOWNS]; clip.poses.len()];
+    if contacts.iter().any(|c| !c.is_empty()) {
+        changes = minimise(&footing, changes, &SOLVE).0;
+    }
     let poses = changes.iter().enumerate().map(|(frame, x)| footing.pose(frame, x)).collect();
     let planted = Clip { poses, ..clip.clone() };
     let slides = |side: usize| {

@@ -503,3 +503,14 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
         assert_eq!(planted.sliding, 0);
     }
 }
+
+#[test]
+fn who_never_stands_is_left_alone() {
+    // Carried through the air at 3 m/s.
+    let pose = |k: usize| Pose::rest(Vector3::new(0.0, 3.0, 0.05 * k as f64));
+    for frames in [0, 1, 2, 40] {
+        let clip = Clip { fps: 60.0, poses: (0..frames).map(pose).collect(), offsets: offsets(), hip_height_m: hip_height_m() };
+        let planted = plant_feet(&clip);
+        assert!(planted.clip.poses == clip.poses && planted.sliding == 0 && planted.contacts.iter().all(Vec::is_empty));
+    }
+}
