@@ -3,11 +3,12 @@
 //! Unknowns x(t) of a frame: shift of the root, its turn about the vertical, and for each leg rotation vectors of hip and ankle
 //! and the bend of the knee, all on the right of the motion's own rotations. With p_i(t) the heel, ball and toe tip, y_i
 //! their heights and u_k the unknowns by their scales,
-//!   min ∫ Σ_k (c_k u_k² + τ_k⁴ ü_k²) + Σ_i (w_i |ṗ_i,horizontal|²/σ_v² + v_i (y_i − y_i,own)²/σ_y²) dt              (1)
-//! During a contact w_i = b(h_i/h0) with h_i the height over the foot's lowest point and the bump b(r) = (1 − r²)²; so who
-//! touches with the toe alone may pivot on it. v_i = b(height over the floor/h1): feet come down where they did.
-//! c_k is 1, and [`FREE`] squared for a leg that does not stand. Everything is a difference of neighbouring frames, so the
-//! equations are a band of three frames.
+//!   min ∫ Σ_k (c_k u_k² + τ_k⁴ ü_k²) + Σ_m (Σ_i a_mi · ṗ_i)²/σ_v² + Σ_i v_i (y_i − y_i,own)²/σ_y² dt                (1)
+//! During a contact a_m are the three ways in which touching points slide as one: along x and z, and turning about their
+//! centre, each a unit vector under the weights w_i = b(h_i/h0), h_i the height over the foot's lowest point and b(r) = (1 − r²)²;
+//! so who touches with the toe alone may pivot on it, and toes that wriggle do not wrench the ankle.
+//! v_i = b(height over the floor/h1): feet come down where they did. c_k is 1, and [`FREE`] squared for a leg that does not
+//! stand. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
 //! Checked against central differences.
 
 use std::ops::Range;
@@ -31,10 +32,10 @@ pub const UNKNOWNS: usize = ROOT + 2 * LEG;
 /// way more spares the legs and leaves the path.
 const JOINT: f64 = 0.02;
 const TURN: f64 = 0.012;
-const SHIFT_M: f64 = 0.015;
+const SHIFT_M: f64 = 0.01;
 /// How much more a joint's change weighs while its foot does not stand. Less lets the swing change as much as the stance; more
 /// only hastens the changes at touch-down.
-const FREE: f64 = 12.0;
+const FREE: f64 = 8.0;
 /// τ of legs and root, seconds. Shorter jerks, longer changes the swing, or for the root leaves more to the legs.
 const LEG_S: f64 = 0.08;
 const ROOT_S: f64 = 0.2;
@@ -52,10 +53,13 @@ pub type Change = [f64; UNKNOWNS];
 /// A point of a sole and its derivatives by the unknowns of the root and of its own leg.
 type Point = (Vector3<f64>, SMatrix<f64, 3, { ROOT + LEG }>);
 
+/// a_m of the three points of a sole.
+type Slide = [Vector3<f64>; 3];
+
 /// One foot over the frames; per frame the three points of its sole.
 struct Foot {
-    /// w_i between a frame and the next.
-    touch: Vec<[f64; 3]>,
+    /// From a frame to the next within a contact.
+    slides: Vec<Option<[Slide; 3]>>,
     /// v_i.
     near: Vec<[f64; 3]>,
     heights: Vec<[f64; 3]>,
@@ -72,7 +76,7 @@ impl Foot {
     fn new(clip: &Clip, track: &FootTrack, contacts: &[Range<usize>]) -> Foot {
         let frames = clip.poses.len();
         let mut foot = Foot {
-            touch: vec![[0.0; 3]; frames],
+            slides: vec![None; frames],
             near: track.soles.iter().map(|sole| sole.map(|p| bump(p.y.max(0.0) / NEAR_M))).collect(),
             heights: clip.poses.iter().map(|pose| clip.sole_points(&clip.place(pose), track.ankle).map(|p| p.y)).collect(),
             stands: vec![false; frames],
@@ -80,8 +84,7 @@ impl Foot {
         for contact in contacts {
             foot.stands[contact.clone()].fill(true);
             for frame in contact.start..contact.end - 1 {
-                let [a, b] = [frame, frame + 1].map(|f| touching(&track.soles[f]));
-                foot.touch[frame] = std::array::from_fn(|i| 0.5 * (a[i] + b[i]));
+                foot.slides[frame] = Some(slides(&track.soles[frame], &track.soles[frame + 1]));
             }
         }
         foot
@@ -92,7 +95,19 @@ fn bump(r: f64) -> f64 {
     (1.0 - r * r).max(0.0).powi(2)
 }
 
-/// w_i of a sole.
+/// a_m of the sole's touching points between two frames.
+fn slides(from: &[Vector3<f64>; 3], to: &[Vector3<f64>; 3]) -> [Slide; 3] {
+    let [u, v] = [from, to].map(touching);
+    let weights: [f64; 3] = std::array::from_fn(|i| 0.5 * (u[i] + v[i]));
+    let sum: f64 = weights.iter().sum();
+    let centre = (0..3).map(|i| from[i] * (weights[i] / sum)).sum::<Vector3<f64>>();
+    let about: [Vector3<f64>; 3] = std::array::from_fn(|i| Vector3::y().cross(&(from[i] - centre)) * weights[i]);
+    let size = (0..3).map(|i| weights[i] * (from[i] - centre).xz().norm_squared()).sum::<f64>().sqrt();
+    let along = |axis: Vector3<f64>| weights.map(|w| axis * (w / sum.sqrt()));
+    [along(Vector3::x()), along(Vector3::z()), about.map(|a| if size > 1e-6 { a / size } else { Vector3::zeros() })]
+}
+
+/// w_i of a sole; 1 for its lowest point.
 fn touching(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
     let lowest = sole.iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
     sole.map(|p| bump((p.y - lowest) / TOUCH_M))
@@ -155,23 +170,24 @@ impl<'a> Footing<'a> {
         self.calm(state, &mut take);
         let dt_s = 1.0 / self.clip.fps;
         let soles: Vec<_> = state.iter().enumerate().map(|(t, x)| self.soles(t, x)).collect();
-        for (t, side, i) in (0..state.len()).flat_map(|t| (0..6).map(move |k| (t, k / 3, k % 3))) {
+        for (t, side) in (0..state.len()).flat_map(|t| [(t, 0), (t, 1)]) {
             let foot = &self.feet[side];
-            let terms = |t: usize, row: usize, factor: f64| {
-                let by = soles[t][side][i].1;
-                (0..ROOT + LEG).map(move |k| (t * UNKNOWNS + if k < ROOT { k } else { k + side * LEG }, factor * by[(row, k)]))
+            // Σ a · p at an instant, and its derivatives.
+            let sum = |t: usize, a: &Slide| (0..3).map(|i| a[i].dot(&soles[t][side][i].0)).sum::<f64>();
+            let by = |t: usize, a: &Slide, factor: f64| {
+                let row = (0..3).map(|i| a[i].transpose() * soles[t][side][i].1 * factor).sum::<SMatrix<f64, 1, { ROOT + LEG }>>();
+                (0..ROOT + LEG).map(move |k| (t * UNKNOWNS + if k < ROOT { k } else { k + side * LEG }, row[k]))
             };
-            if foot.near[t][i] > 0.0 {
+            for i in (0..3).filter(|i| foot.near[t][*i] > 0.0) {
                 let factor = (dt_s * foot.near[t][i]).sqrt() / HEIGHT_M;
-                let terms: [_; ROOT + LEG] = gather(terms(t, 1, factor));
-                take(factor * (soles[t][side][i].0.y - foot.heights[t][i]), &terms);
+                let up: Slide = std::array::from_fn(|k| if k == i { Vector3::y() } else { Vector3::zeros() });
+                let terms: [_; ROOT + LEG] = gather(by(t, &up, factor));
+                take(factor * (sum(t, &up) - foot.heights[t][i]), &terms);
             }
-            if foot.touch[t][i] > 0.0 {
-                let factor = (foot.touch[t][i] / dt_s).sqrt() / SLIDE_M_S;
-                for row in [0, 2] {
-                    let terms: [_; 2 * (ROOT + LEG)] = gather(terms(t, row, -factor).chain(terms(t + 1, row, factor)));
-                    take(factor * (soles[t + 1][side][i].0[row] - soles[t][side][i].0[row]), &terms);
-                }
+            for a in foot.slides[t].iter().flatten() {
+                let factor = 1.0 / (dt_s.sqrt() * SLIDE_M_S);
+                let terms: [_; 2 * (ROOT + LEG)] = gather(by(t, a, -factor).chain(by(t + 1, a, factor)));
+                take(factor * (sum(t + 1, a) - sum(t, a)), &terms);
             }
         }
     }
@@ -246,7 +262,7 @@ mod tests {
         let tracks = LEGS.map(|leg| FootTrack::new(&clip, leg[2]));
         let contacts = tracks.each_ref().map(|foot| foot.contacts(&clip));
         let footing = Footing::new(&clip, &tracks, &contacts);
-        assert!(footing.feet.iter().all(|f| f.touch.iter().any(|w| w.iter().any(|w| *w > 0.0)) && f.stands.iter().any(|s| !s)));
+        assert!(footing.feet.iter().all(|f| f.slides.iter().any(Option::is_some) && f.stands.iter().any(|s| !s)));
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let state: Vec<Change> = clip.poses.iter().map(|_| std::array::from_fn(|_| 0.2 * (rng.random::<f64>() - 0.5))).collect();
         let residuals = |state: &[Change]| {

@@ -466,7 +466,9 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
     let gaits = gaits();
     let straight = follow(&gaits, &outing(), &offsets(), 60.0).0;
     let bend = follow(&gaits, &Profile::steady(1.4, 0.25, 6.0).unwrap(), &offsets(), 60.0).0;
-    for (name, clip) in [("start, walk, run, stop", straight), ("bend of 4 m", bend)] {
+    let run = follow(&gaits, &Profile::steady(3.0, -0.25, 6.0).unwrap(), &offsets(), 60.0).0;
+    // The pelvis may leave the path by as many millimetres.
+    for (name, clip, most_mm) in [("start, walk, run, stop", straight, 30.0), ("bend of 4 m", bend, 30.0), ("run in a bend of 4 m", run, 80.0)] {
         let planted = plant_feet(&clip);
         let [before, after] = [&clip, &planted.clip].map(|c| largest_drift(c, &planted.contacts));
         let [calm, shaken] = [&clip, &planted.clip].map(largest_accelerations);
@@ -497,8 +499,8 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
             planted.contacts.iter().map(Vec::len).sum::<usize>(),
         );
         assert!(after < 0.003 && after < 0.1 * before, "{before} {after}");
-        assert!(elsewhere < 3.0 && standing < 8.0 && others < 1e-6, "{elsewhere} {standing} {others}");
-        assert!(shift_mm < 60.0 && turn < 5.0, "{shift_mm} {turn}");
+        assert!(elsewhere < 3.0 && standing < 6.0 && others < 1e-6, "{elsewhere} {standing} {others}");
+        assert!(shift_mm < most_mm && turn < 5.0, "{shift_mm} {turn}");
         assert!((0..2).all(|k| shaken[k] < 1.05 * calm[k]), "{calm:?} {shaken:?}");
         assert_eq!(planted.sliding, 0);
     }
