@@ -10,8 +10,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use muybridge::math::pca::pca;
 use muybridge::body::Shape;
+use muybridge::math::pca::pca;
 use muybridge::motion::{Gait, Gaits, Player};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::style::Population;

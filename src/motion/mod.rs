@@ -18,4 +18,6 @@ pub use player::{Gaits, Player};
 pub use profile::{Course, Profile, ProfileError, Step, Waypoint, follow};
 
 #[cfg(test)]
+mod live_tests;
+#[cfg(test)]
 mod tests;
