@@ -80,7 +80,7 @@ impl FootTrack {
         (0..3).map(|i| (there[i] - here[i]) * (0.5 * (u[i] + v[i]))).sum()
     }
 
-    /// How far a point of the sole goes from where it touched first, while it is within [`TOUCHES_M`] of the lowest; the largest
+    /// How far a point of the sole goes from where it touched first, while it is within 2 mm of the lowest; the largest
     /// over the frames of a contact, metres.
     pub fn drift_m(&self, contact: Range<usize>) -> f64 {
         let mut first: [Option<Vector3<f64>>; 3] = [None; 3];

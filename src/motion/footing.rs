@@ -7,7 +7,7 @@
 //! During a contact a_m are the three ways in which touching points slide as one: along x and z, and turning about their
 //! centre, each a unit vector under the weights w_i = b(h_i/h0), h_i the height over the foot's lowest point and b(r) = (1 − r²)²;
 //! so who touches with the toe alone may pivot on it, and toes that wriggle do not wrench the ankle.
-//! v_i = b(height over the floor/h1): feet come down where they did. c_k is 1, and [`FREE`] squared for a leg that does not
+//! v_i = b(height over the floor/h1): feet come down where they did. c_k is 1, and `FREE` squared for a leg that does not
 //! stand. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
 //! Checked against central differences.
 
