@@ -48,7 +48,7 @@ const TOUCH_M: f64 = 0.01;
 const NEAR_M: f64 = 0.03;
 
 /// Unknowns of one frame.
-pub type Change = [f64; UNKNOWNS];
+pub type Unknowns = [f64; UNKNOWNS];
 
 /// A point of a sole and its derivatives by the unknowns of the root and of its own leg.
 type Point = (Vector3<f64>, SMatrix<f64, 3, { ROOT + LEG }>);
@@ -118,7 +118,7 @@ fn vector(x: &[f64]) -> Vector3<f64> {
 }
 
 /// Hip, knee and ankle vectors of a leg's unknowns.
-fn leg_vectors(x: &Change, side: usize) -> [Vector3<f64>; 3] {
+fn leg_vectors(x: &Unknowns, side: usize) -> [Vector3<f64>; 3] {
     let leg = &x[ROOT + side * LEG..][..LEG];
     [vector(leg), Vector3::new(leg[3], 0.0, 0.0), vector(&leg[4..])]
 }
@@ -130,7 +130,7 @@ impl<'a> Footing<'a> {
     }
 
     /// The pose of a frame after its change.
-    pub fn pose(&self, frame: usize, x: &Change) -> Pose {
+    pub fn pose(&self, frame: usize, x: &Unknowns) -> Pose {
         let mut pose = self.clip.poses[frame].clone();
         pose.root += vector(x);
         pose.world_from_root = exp(&Vector3::new(0.0, x[3], 0.0)) * pose.world_from_root;
@@ -142,7 +142,7 @@ impl<'a> Footing<'a> {
         pose
     }
 
-    fn soles(&self, frame: usize, x: &Change) -> [[Point; 3]; 2] {
+    fn soles(&self, frame: usize, x: &Unknowns) -> [[Point; 3]; 2] {
         let pose = self.pose(frame, x);
         let placed = place(&self.clip.offsets, &pose);
         std::array::from_fn(|side| {
@@ -166,7 +166,7 @@ impl<'a> Footing<'a> {
     }
 
     /// Every residual of (1) with its derivatives by unknowns, places increasing.
-    fn residuals(&self, state: &[Change], mut take: impl FnMut(f64, &[(usize, f64)])) {
+    fn residuals(&self, state: &[Unknowns], mut take: impl FnMut(f64, &[(usize, f64)])) {
         self.calm(state, &mut take);
         let dt_s = 1.0 / self.clip.fps;
         let soles: Vec<_> = state.iter().enumerate().map(|(t, x)| self.soles(t, x)).collect();
@@ -193,7 +193,7 @@ impl<'a> Footing<'a> {
     }
 
     /// The first two terms of (1).
-    fn calm(&self, state: &[Change], take: &mut impl FnMut(f64, &[(usize, f64)])) {
+    fn calm(&self, state: &[Unknowns], take: &mut impl FnMut(f64, &[(usize, f64)])) {
         let dt_s = 1.0 / self.clip.fps;
         for (t, k) in (0..state.len()).flat_map(|t| (0..UNKNOWNS).map(move |k| (t, k))) {
             let (scale, tau_s) = match k {
@@ -221,15 +221,15 @@ fn gather<const N: usize>(terms: impl Iterator<Item = (usize, f64)>) -> [(usize,
 }
 
 impl ArrowProblem for &Footing<'_> {
-    type State = Vec<Change>;
+    type State = Vec<Unknowns>;
 
-    fn cost(&self, state: &Vec<Change>) -> f64 {
+    fn cost(&self, state: &Vec<Unknowns>) -> f64 {
         let mut sum = 0.0;
         self.residuals(state, |r, _| sum += r * r);
         0.5 * sum
     }
 
-    fn linearise(&self, state: &Vec<Change>) -> NormalEquations {
+    fn linearise(&self, state: &Vec<Unknowns>) -> NormalEquations {
         let mut normal = NormalEquations::zeros(state.len() * UNKNOWNS, 3 * UNKNOWNS - 1, 0);
         self.residuals(state, |residual, terms| {
             normal.cost += 0.5 * residual * residual;
@@ -241,7 +241,7 @@ impl ArrowProblem for &Footing<'_> {
         normal
     }
 
-    fn retract(&self, state: &Vec<Change>, y: &DVector<f64>, _: &DVector<f64>) -> Vec<Change> {
+    fn retract(&self, state: &Vec<Unknowns>, y: &DVector<f64>, _: &DVector<f64>) -> Vec<Unknowns> {
         state.iter().zip(y.as_slice().chunks_exact(UNKNOWNS)).map(|(x, d)| std::array::from_fn(|k| x[k] + d[k])).collect()
     }
 }
@@ -264,8 +264,8 @@ mod tests {
         let footing = Footing::new(&clip, &tracks, &contacts);
         assert!(footing.feet.iter().all(|f| f.slides.iter().any(Option::is_some) && f.stands.iter().any(|s| !s)));
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let state: Vec<Change> = clip.poses.iter().map(|_| std::array::from_fn(|_| 0.2 * (rng.random::<f64>() - 0.5))).collect();
-        let residuals = |state: &[Change]| {
+        let state: Vec<Unknowns> = clip.poses.iter().map(|_| std::array::from_fn(|_| 0.2 * (rng.random::<f64>() - 0.5))).collect();
+        let residuals = |state: &[Unknowns]| {
             let mut found = Vec::new();
             footing.residuals(state, |r, _| found.push(r));
             found
