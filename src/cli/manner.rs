@@ -82,12 +82,19 @@ impl MannerArgs {
         self.attribute.is_empty() && self.caricature.is_none()
     }
 
+    /// Attributes that stay as they are make one change together.
+    fn is_steady(&self) -> bool {
+        !self.attribute.is_empty() && self.attribute.iter().all(|knob| knob.amount.0.len() == 1)
+    }
+
     /// Amounts over time, in the order in which [`MannerArgs::teach`] adds the changes.
     pub fn courses(&self) -> Result<Vec<Course>> {
         let scaled = |a: &Amount, f: &dyn Fn(f64) -> f64| a.0.iter().map(|(t, v)| (*t, f(*v))).collect();
         let sides = |knob: &Knob| knob.amount.sides().map(|side| scaled(&knob.amount, &|v| (v / side).max(0.0))).collect::<Vec<_>>();
-        let caricature = self.caricature.iter().map(|degree| scaled(degree, &|v| v - 1.0));
-        Ok(self.attribute.iter().flat_map(sides).chain(caricature).map(Course::new).collect::<Result<_, _>>()?)
+        let mut all: Vec<Vec<(f64, f64)>> =
+            if self.is_steady() { vec![vec![(0.0, 1.0)]] } else { self.attribute.iter().flat_map(sides).collect() };
+        all.extend(self.caricature.iter().map(|degree| scaled(degree, &|v| v - 1.0)));
+        Ok(all.into_iter().map(Course::new).collect::<Result<_, _>>()?)
     }
 
     /// Adds the changes to a gait; `typical` is that of the model's people on average, and `speed_m_s` where the two are compared.
@@ -102,20 +109,24 @@ impl MannerArgs {
         Ok(())
     }
 
-    /// The most and the least wanted of every attribute, the others held: exactly what `blend attribute` makes.
+    /// All attributes together where they are steady, else the most and the least wanted of each: what `blend attribute` makes.
     fn attributes(&self, gait: &Gait) -> Result<Vec<Change>> {
         let Some(path) = &self.space else { return Ok(Vec::new()) };
         let space = read_space(path)?;
         if !space.layout.cyclic {
             bail!("{} is a space of whole motions; attributes of gaits need one of cycles", file_name(path));
         }
-        let mut changes = Vec::new();
-        for knob in &self.attribute {
-            let vector = unit(&space, &knob.name)?;
-            let at = |amount: f64| space.play(&space.mean().plus(&vector, amount, amount));
-            changes.extend(knob.amount.sides().map(|side| gait.change(&at(0.0), &at(side))));
+        let units = self.attribute.iter().map(|knob| unit(&space, &knob.name)).collect::<Result<Vec<_>>>()?;
+        let mean = space.mean();
+        let change = |to: &Vectors| gait.change(&space.play(&mean), &space.play(to));
+        let knobs = || self.attribute.iter().zip(&units);
+        if self.is_steady() {
+            let all = knobs().flat_map(|(knob, unit)| knob.amount.0.iter().map(move |point| (point.1, unit)));
+            return Ok(vec![change(&all.fold(mean.clone(), |sum, (amount, unit)| sum.plus(unit, amount, amount)))]);
         }
-        Ok(changes)
+        Ok(knobs()
+            .flat_map(|(knob, unit)| knob.amount.sides().map(|side| change(&mean.plus(unit, side, side))).collect::<Vec<_>>())
+            .collect())
     }
 }
 
@@ -145,6 +156,9 @@ mod tests {
         assert_eq!([1.0, 1.2, 2.0, 3.0].map(|t| courses[0].at(t)), [0.5, 0.0, 0.0, 1.0]);
         assert_eq!([1.0, 1.2, 2.0, 3.0].map(|t| courses[1].at(t)), [0.0, 0.0, 1.0, 0.0]);
         assert!(courses.len() == 3 && (courses[2].at(7.0) - 0.3).abs() < 1e-12);
+        let attribute = ["energy=1", "grace=-2"].map(|k| k.parse().unwrap()).to_vec();
+        let steady = MannerArgs { space: None, attribute, caricature: None }.courses().unwrap();
+        assert!(steady.len() == 1 && steady[0].at(3.0) == 1.0);
         let said = |text: &str| text.parse::<Knob>().err().unwrap();
         assert!(said("energy").contains("NAME=AMOUNT") && said("energy=much").contains("`much` in `much` is not a number"));
         assert!(said("energy=0:1,0:2").contains("times must increase") && said("energy=nan").contains("finite"));
