@@ -603,15 +603,30 @@ pub(super) mod tests {
         }
     }
 
+    fn to_the_skin(surface: &PosedSurface, x: &mut Vector3<f64>) {
+        for _ in 0..20 {
+            let at = surface.evaluate(x);
+            *x -= at.gradient.normalize() * at.distance().clamp(-0.02, 0.02);
+        }
+    }
+
     #[test]
     fn skin_that_is_off_pulls_as_points_that_are_moved() {
         let model = made_up_model(3);
         let curve = Curve::new(&model, 3);
         let state = state();
-        let frames = frames(&curve, &state);
+        let mut frames = frames(&curve, &state);
+        for (t, frame) in frames.iter_mut().enumerate() {
+            let posed = state.posed(&curve, &Surface::new(&state.shape), t).surface;
+            for target in &mut frame.targets {
+                if let Target::Point { x, .. } = target {
+                    to_the_skin(&posed, x);
+                }
+            }
+        }
         let mut problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
         let (pulls, before) = (problem.skin_pulls(&state), problem.linearise(&state));
-        let node = problem.frozen.iter().flatten().max_by(|a, b| a.weight.total_cmp(&b.weight)).unwrap().node;
+        let node = problem.frozen.iter().flatten().filter(|f| f.is_point).max_by(|a, b| a.weight.total_cmp(&b.weight)).unwrap().node;
         let (surface, off_m) = (Surface::new(&state.shape), 1e-6);
         for t in 0..frames.len() {
             let posed = state.posed(&curve, &surface, t).surface;
