@@ -10,7 +10,7 @@ use super::images;
 use super::kalibr;
 use super::opencv_yml;
 use super::video::{self, Video};
-use crate::rig::{Rig, RigError, Up};
+use crate::rig::{Rig, RigError, Up, is_file_name};
 use nalgebra::{Matrix3, Rotation3};
 use std::path::{Path, PathBuf};
 
@@ -203,7 +203,8 @@ fn size_in(place: &Path, camera: &str) -> Option<[u32; 2]> {
         paths
     };
     let named = listed(place).into_iter().filter(|path| path.file_stem().is_some_and(|stem| stem == camera) && path.is_file());
-    listed(&place.join(camera)).into_iter().chain(named).find_map(|path| file_size(&path))
+    let own = is_file_name(camera).then(|| place.join(camera));
+    own.iter().flat_map(|folder| listed(folder)).chain(named).find_map(|path| file_size(&path))
 }
 
 fn file_size(path: &Path) -> Option<[u32; 2]> {
