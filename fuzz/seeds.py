@@ -52,6 +52,11 @@ def rigs():
     seed("rig_files", "json", json.dumps(keys, indent=1))
     lens = "  camera_model: pinhole\n  intrinsics: [600, 600, 320, 240]\n  distortion_model: radtan\n  distortion_coeffs: [0, 0, 0, 0]\n  resolution: [640, 480]\n"
     move = "  T_cn_cnm1:\n  - [1, 0, 0, -0.3]\n  - [0, 1, 0, 0]\n  - [0, 0, 1, 0]\n  - [0, 0, 0, 1]\n"
+    deep = lambda start, left, right: start + left * 2000 + "1" + right * 2000 + "\n"
+    seed("rig_files", "deep_json", deep("", '{"a":', "}"), "bad")
+    seed("rig_files", "deep_yaml", deep("%YAML:1.0\n---\na: ", "[", "]"), "bad")
+    seed("rig_files", "deep_xml", deep('<?xml version="1.0"?>\n<opencv_storage>', "<a>", "</a>") + "</opencv_storage>", "bad")
+    seed("rig_files", "deep_kalibr", deep("cam0:\n  intrinsics: ", "[", "]"), "bad")
     seed("rig_files", "kalibr", f"cam0:\n{lens}cam1:\n{lens}{move}")
 
 
@@ -137,15 +142,15 @@ def archives():
     joints = re.findall(r'"([a-z_0-9]+)"', source[source.index("fn name") :])[:27][1:]
     common = {"version": 1, "skeleton": "muybridge-hanim-78", "joints": joints, "activity": "walking", "units": "", "blake3": "", "sources": ["a"]}
     model = common | {"format": "muybridge-model", "samples": 100, "root_channels": [], "synthetic": True, "parameter_unit": "m/s", "subjects": ["a"]}
-    space = common | {"format": "muybridge-space", "cyclic": True, "intervals": 2, "timing_per_curve": False, "reference": 0, "members": ["a"]}
+    space = common | {"format": "muybridge-space", "cyclic": True, "intervals": 2, "timing_per_curve": False, "reference": 0, "members": ["a", "b"], "sources": ["a", "b"]}
     space |= {"attributes": ["b"]}
     number = lambda name, *shape: (name, struct.pack("<d", 1.0) * eval("*".join(map(str, shape))), shape, "<f8")
     for target, header, arrays in [
         ("model_npz", model, [number("mean", 7800), number("basis", 1, 7800), number("eigenvalues", 1), number("root_mean", 600)]
          + [number("root_basis", 1, 600), number("vectors", 1, 7800), number("roots", 1, 600)]
          + [number(n, 1) for n in ("parameters", "hip_heights_m", "durations_s")]),
-        ("space_npz", space, [number("shapes", 1, 253), number("timings", 1, 2), number("hip_heights_m", 1), number("labels", 1, 1)]
-         + [number("labelled", 1, 1), number("shape_mean", 253), number("shape_basis", 1, 253), number("shape_eigenvalues", 1)]
+        ("space_npz", space, [number("shapes", 2, 169), number("timings", 2, 2), number("hip_heights_m", 2), number("labels", 2, 1)]
+         + [number("labelled", 2, 1), number("shape_mean", 169), number("shape_basis", 1, 169), number("shape_eigenvalues", 1)]
          + [number("timing_mean", 2), number("timing_basis", 1, 2), number("timing_eigenvalues", 1)]),
     ]:
         text = json.dumps(header).encode()
@@ -195,9 +200,10 @@ def glb():
     }  # fmt: skip
     seed("glb", "leg", chunked(text, blob))
     # The same mesh and the same motion again and again, zeros that nothing holds, joints that are no bones.
-    seed("glb", "same_mesh", chunked(text | {"nodes": text["nodes"] + [{"mesh": 0}] * 6000}, blob), "bad")
+    drawn = [{"primitives": text["meshes"][0]["primitives"] * 300}]
+    seed("glb", "same_mesh", chunked(text | {"meshes": drawn, "nodes": text["nodes"] + [{"mesh": 0}] * 1000}, blob), "bad")
     many = text["animations"][0] | {"channels": [target("rotation", 0)]}
-    seed("glb", "many_bones", chunked(text | {"nodes": text["nodes"] + [{}] * 2000, "animations": [many] * 300}, blob), "bad")
+    seed("glb", "many_bones", chunked(text | {"nodes": text["nodes"] + [{}] * 8000, "animations": [many] * 200}, blob), "bad")
     sparse = {"count": 1, "indices": {"bufferView": 3, "componentType": 5123}, "values": {"bufferView": 0}}
     zeros = accessors[0] | {"count": 2**31, "sparse": sparse}
     del zeros["bufferView"]
@@ -205,6 +211,9 @@ def glb():
     short = {"count": 3, "indices": {"bufferView": 3, "componentType": 5125}, "values": {"bufferView": 5}}
     seed("glb", "short_sparse", chunked(text | {"accessors": [accessors[0] | {"sparse": short}] + accessors[1:]}, blob), "bad")
     seed("glb", "holder_as_joint", chunked(text | {"skins": [{"joints": [0, 2], "inverseBindMatrices": 4}]}, blob))
+    shorter = bytearray(chunked(text, blob))
+    shorter[8:12] = bytes([3, 0, 0, 0])
+    seed("glb", "shorter_than_its_header", bytes(shorter), "bad")
     seed("glb", "no_items", chunked(text | {"accessors": [accessors[0] | {"count": 0}] + accessors[1:]}, blob), "bad")
 
 

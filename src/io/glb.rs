@@ -15,6 +15,8 @@ use super::glb_tracks::motions;
 use super::write_atomic;
 use crate::animal::creature::{Bone, Creature, Local, Motion, Skin, Vertex};
 
+/// Bytes of a GLB file's header.
+const HEADER: u32 = 12;
 /// Corners of triangles, key times, and places of bones that a byte of a file may stand for; most files have less than one.
 const UNFOLDED: usize = 16;
 /// Places of bones beyond that, for large skeletons of which little moves.
@@ -36,6 +38,11 @@ pub enum GlbError {
 /// Reads a creature with all its motions.
 pub fn read(path: &Path) -> Result<Creature, GlbError> {
     let bytes = std::fs::read(path).map_err(|cause| GlbError::Read { path: path.into(), cause })?;
+    // The crate takes the header's own size off the length without a look.
+    let length = bytes.first_chunk::<12>().map_or(u32::MAX, |h| u32::from_le_bytes([h[8], h[9], h[10], h[11]]));
+    if bytes.starts_with(b"glTF") && length < HEADER {
+        return Err(GlbError::Format { path: path.into(), why: "its header promises less than itself".into() });
+    }
     let file = gltf::Gltf::from_slice(&bytes).map_err(|e| GlbError::Format { path: path.into(), why: e.to_string() })?;
     let content = |what: &str| GlbError::Content { path: path.into(), what: what.into() };
     let blob = file.blob.as_deref().unwrap_or_default();
