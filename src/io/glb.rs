@@ -17,7 +17,7 @@ use crate::animal::creature::{Bone, Creature, Local, Motion, Skin, Vertex};
 
 /// Bytes of a GLB file's header.
 const HEADER: u32 = 12;
-/// Corners of triangles, key times, and places of bones that a byte of a file may stand for; most files have less than one.
+/// Values of corners, key times, and places of bones that a byte of a file may stand for; most files have less than one.
 const UNFOLDED: usize = 16;
 /// Places of bones beyond that, for large skeletons of which little moves.
 const UNFOLDED_FREELY: usize = 1_000_000;
@@ -98,15 +98,13 @@ fn reaches(count: usize, view: &gltf::buffer::View, offset: usize, size: usize) 
     reach.is_some_and(|r| r <= view.length())
 }
 
-/// Nodes may share meshes, and channels key times: corners and keys that the file unfolds to, before any of them is made.
+/// Nodes may share meshes and skins, and channels key times: values, joints and keys that the file unfolds to, before any is read.
 fn unfolded(document: &gltf::Document) -> usize {
-    let corners = |p: gltf::Primitive| {
-        let counts = [p.get(&gltf::Semantic::Positions), p.indices()].map(|a| a.map_or(0, |a| a.count()));
-        counts.iter().fold(0, |sum: usize, n| sum.saturating_add(*n))
-    };
-    let drawn = document.nodes().filter_map(|node| node.mesh()).flat_map(|mesh| mesh.primitives()).map(corners);
+    let values = |p: gltf::Primitive| p.attributes().map(|(_, a)| a).chain(p.indices()).map(|a| a.count()).fold(0, usize::saturating_add);
+    let drawn = document.nodes().filter_map(|node| node.mesh()).flat_map(|mesh| mesh.primitives()).map(values);
+    let joints = document.nodes().filter_map(|node| node.skin()).map(|skin| skin.joints().count());
     let keys = document.animations().flat_map(|a| a.channels()).map(|c| c.sampler().input().count());
-    drawn.chain(keys).fold(0, usize::saturating_add)
+    drawn.chain(joints).chain(keys).fold(0, usize::saturating_add)
 }
 
 /// Whether a node only holds a skinned mesh, which moves with its joints: such nodes are no bones.
