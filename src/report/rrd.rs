@@ -9,8 +9,9 @@
 //! | `world/body`, `world/skeleton` | ellipsoids of the surface, bones by side | per frame |
 //! | `curves/phase`, `curves/root/x` (`y`, `z`), `curves/points` | cycles, metres, number of points | per frame |
 //!
-//! Timelines: `frame`, the frames' numbers, and `time`, seconds since the first. The same session gives the same content, but not
-//! the same bytes: rerun numbers its chunks by the clock. Checked by rerun's own reader in Python.
+//! Timelines: `frame`, the frames' numbers, and `time`, seconds since the first; rerun adds when it was told (`log_time`,
+//! `log_tick`), so that the same session gives the same content, but not the same bytes. Checked by rerun's own reader in Python,
+//! `benches/rrd.py`.
 
 use std::path::{Path, PathBuf};
 
@@ -53,9 +54,6 @@ impl Recording {
     pub fn begin(path: &Path, session: &str, rig: &Rig, fit: &Fit) -> Result<Recording, RrdError> {
         let failed = |error| RrdError::Record { path: path.into(), error: Box::new(error) };
         let stream = RecordingStreamBuilder::new("muybridge").recording_name(session).save(path).map_err(failed)?;
-        for clock in ["log_time", "log_tick"] {
-            stream.disable_timeline(clock);
-        }
         let shape = fit.shape();
         let recording = Recording { stream, path: path.into(), surface: Surface::new(shape), offsets: shape.offsets() };
         let axes = if rig.up == Up::Y { ViewCoordinates::RIGHT_HAND_Y_UP() } else { ViewCoordinates::RIGHT_HAND_Z_UP() };
