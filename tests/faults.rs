@@ -55,6 +55,9 @@ fn contents(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     files_below(folder).into_iter().map(|path| (name(&path), fs::read(&path).unwrap())).collect()
 }
 
+/// Those of [`commands`] that every test can afford.
+const SHORT: [&str; 3] = ["model build", "generate", "track"];
+
 /// Recordings of three people, and commands that write files of all kinds to `$PLACE/out`.
 fn commands(place: &Path) -> Vec<(&'static str, String)> {
     let (session, mocap) = (place.join("session"), place.join("mocap"));
@@ -111,7 +114,7 @@ fn a_disk_that_can_only_be_read_is_one_sentence() {
     let place = tempfile::tempdir().unwrap();
     let study = study(place.path(), &["one"]);
     let batch = ("batch", format!("\"$MB\" batch {} -o \"$PLACE/out\"", text(&study)));
-    for (name, script) in commands(place.path()).into_iter().chain([batch]) {
+    for (name, script) in commands(place.path()).into_iter().filter(|(name, _)| SHORT.contains(name)).chain([batch]) {
         let disk = place.path().join("disk");
         let script = format!("mkdir \"$PLACE/out\"; mount -o remount,ro \"$PLACE\"; {script}");
         let output = on_disk(&disk, "size=1m", &place.path().join(format!("kept of {name}")), &script);
@@ -152,7 +155,7 @@ fn a_batch_on_a_full_disk_goes_on_when_there_is_room() {
 #[test]
 fn a_limit_on_the_size_of_files_is_one_sentence() {
     let place = tempfile::tempdir().unwrap();
-    for (name, script) in commands(place.path()) {
+    for (name, script) in commands(place.path()).into_iter().filter(|(name, _)| SHORT.contains(name)) {
         let folder = place.path().join(format!("limited {name}"));
         let mut command = Command::new("bash");
         command.args(["-c", &format!("ulimit -f 100; {script}")]).stdin(Stdio::null());
@@ -204,7 +207,7 @@ fn a_frame_that_vanishes_in_mid_run_fails_its_session_only() {
     let output = run.wait_with_output().unwrap();
     assert_eq!(output.status.code(), Some(1), "{}", said(&output));
     let reason = status(&results, "a")["reason"].as_str().unwrap().to_string();
-    assert!(reason.contains("frame 8 is missing in cam_01 but not in cam_00"), "{reason}");
+    assert!(reason.contains("cam_01 has no frame 8"), "{reason}");
     assert_eq!(state(&results, "b"), "done");
 
     // Put back, it is worked on by itself.
