@@ -314,18 +314,6 @@ fn motion_files_with_errors_are_refused_with_their_place() {
     }
 }
 
-#[cfg(not(feature = "rerun"))]
-#[test]
-fn a_recording_for_rerun_says_how_to_get_it_before_any_work() {
-    let (study, session) = session("png");
-    let output = study.path().join("out");
-    fails(
-        &["track", text(&session), "-o", text(&output), "--rrd", "a.rrd"],
-        &["rerun's SDK", "build it with `cargo build", "--features rerun`"],
-    );
-    nothing_written(&output);
-}
-
 #[test]
 fn wrong_usage_exits_with_2() {
     for arguments in [

@@ -19,7 +19,6 @@ mod profile;
 mod progress;
 mod render;
 mod rig;
-mod rrd;
 pub mod say;
 mod track;
 mod track_report;

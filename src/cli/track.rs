@@ -52,9 +52,6 @@ pub struct TrackArgs {
     /// Also draw the result into DIR/pictures
     #[arg(long)]
     pictures: bool,
-    /// Also record cameras, pictures, clouds, body and curves for rerun's viewer; needs a program built with --features rerun
-    #[arg(long, value_name = "FILE.rrd")]
-    rrd: Option<PathBuf>,
     /// Leave out report.html, thumbnail.jpg, gait.csv and angles_cycle.csv
     #[arg(long)]
     no_report: bool,
@@ -110,9 +107,6 @@ impl TrackArgs {
 }
 
 pub fn run(args: &TrackArgs) -> Result<()> {
-    if args.rrd.is_some() {
-        super::rrd::ready()?;
-    }
     let config = args.config()?;
     let model = match &config.model {
         Some(path) => NamedModel::new(model_npz::read_model(path)?, file_name(path)),
@@ -138,9 +132,6 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     }
     if config.pictures == Some(true) {
         draw(&args.output.join("pictures"), &session.rig, &model, &tracked)?;
-    }
-    if let Some(path) = &args.rrd {
-        super::rrd::write(path, &session, &tracked)?;
     }
     summary(&args.output, &tracked.fit);
     Ok(())

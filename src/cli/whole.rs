@@ -37,7 +37,7 @@ pub fn publish(partial: TempDir, folder: &Path) -> Result<()> {
 }
 
 /// A finished file or folder to its place.
-pub fn rename(from: &Path, to: &Path) -> Result<()> {
+fn rename(from: &Path, to: &Path) -> Result<()> {
     std::fs::rename(from, to).map_err(with_remedy).with_context(|| format!("cannot write {}", to.display()))
 }
 

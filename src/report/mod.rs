@@ -28,8 +28,6 @@ pub mod overlay;
 pub mod page;
 pub mod person;
 pub mod rig;
-#[cfg(feature = "rerun")]
-pub mod rrd;
 pub mod strips;
 pub mod study;
 pub mod style_charts;
