@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What a batch costs and survives: 60 sessions of which 6 are broken, 20 kills, 10 to 200 sessions, optionally Slurm.
 
-    python3 benches/batch.py target/release/muybridge /tmp/batch-bench [--sessions 60] [--kills 20] [--counts 10,50,200] [--slurm]
+    python3 benches/batch.py target/release/muybridge /tmp/batch-bench [--sessions 60] [--kills 20] [--counts 10,50,200] [--threads 1] [--slurm]
 
 Prints one line per figure. The footage is the phantom's: 6 frames of 160x120 px per session. Takes about twenty minutes on
 two idle cores; other load makes the figures of cores and seconds worse.
@@ -14,6 +14,7 @@ parser.add_argument("place")
 parser.add_argument("--sessions", type=int, default=60)
 parser.add_argument("--kills", type=int, default=20)
 parser.add_argument("--counts", default="10,50,200")
+parser.add_argument("--threads", type=int, help="of the batches of --counts; all cores without it")
 parser.add_argument("--slurm", action="store_true")
 args = parser.parse_args()
 PROGRAM, PLACE = os.path.abspath(args.muybridge), os.path.abspath(args.place)
@@ -130,7 +131,8 @@ def occupied(results, seconds, jobs):
 
 def supervisor_peak_mb(folder, results):
     """Largest resident memory of the supervising process alone, sampled."""
-    process = subprocess.Popen([PROGRAM, "batch", folder, "-o", results], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    threads = ["--threads", str(args.threads)] if args.threads else []
+    process = subprocess.Popen([PROGRAM, *threads, "batch", folder, "-o", results], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     peak, clock, ended = 0.0, time.monotonic(), None
     ticks = lambda: sum(int(v) for v in open(f"/proc/{process.pid}/stat").read().rsplit(")", 1)[1].split()[11:15])
     cpu = 0
@@ -178,4 +180,4 @@ for count in map(int, filter(None, args.counts.split(","))):
     many = study(f"many_{count}", source, count, {})
     peak, seconds, cpu = supervisor_peak_mb(many, os.path.join(PLACE, f"results_{count}"))
     print(f"{count} sessions: {seconds:.1f} s, {seconds / count:.3f} s and {cpu / count:.3f} CPU s a session, supervisor {peak:.0f} MB, "
-          f"{100 * occupied(os.path.join(PLACE, f'results_{count}'), seconds, os.cpu_count()):.1f} % of the jobs in work")
+          f"{100 * occupied(os.path.join(PLACE, f'results_{count}'), seconds, args.threads or os.cpu_count()):.1f} % of the jobs in work")

@@ -1,10 +1,26 @@
+/// The standard macros panic where nobody listens; see [`cli::say`].
+macro_rules! println {
+    () => { crate::cli::say::out(format_args!(""), "\n") };
+    ($($text:tt)*) => { crate::cli::say::out(format_args!($($text)*), "\n") };
+}
+macro_rules! print {
+    ($($text:tt)*) => { crate::cli::say::out(format_args!($($text)*), "") };
+}
+macro_rules! eprintln {
+    ($($text:tt)*) => { crate::cli::say::err(format_args!($($text)*)) };
+}
+
 mod cli;
 
+use anyhow::Context;
 use clap::Parser;
 
 fn main() -> std::process::ExitCode {
     cli::silence_opencv();
-    match cli::run(cli::Cli::parse()) {
+    cli::outlive_file_limits();
+    let done = cli::run(cli::Cli::parse());
+    let heard = || cli::say::lost().map_or(Ok(()), |error| Err(error).context("cannot write to standard output"));
+    match done.and_then(|()| heard()) {
         Ok(()) => std::process::ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {}", sentence(&error));

@@ -20,6 +20,7 @@ mod profile;
 mod progress;
 mod render;
 mod rig;
+pub mod say;
 mod track;
 mod track_report;
 mod whole;
@@ -81,6 +82,16 @@ pub fn silence_opencv() {
             // SAFETY: called first in main, while there is no other thread that could read the environment.
             unsafe { std::env::set_var(variable, quiet) };
         }
+    }
+}
+
+/// A write beyond the largest allowed file (`ulimit -f`) shall be an error of that write, with its sentence, not the silent end of
+/// the program.
+pub fn outlive_file_limits() {
+    #[cfg(unix)]
+    // SAFETY: ignoring a signal runs no code of ours.
+    unsafe {
+        libc::signal(libc::SIGXFSZ, libc::SIG_IGN);
     }
 }
 

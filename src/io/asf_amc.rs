@@ -17,6 +17,9 @@ use super::mapping::{RecordedFrame, RecordedJoint, Recording};
 const FPS: f64 = 120.0;
 const METRES_PER_INCH: f64 = 0.0254;
 
+/// Bones that may come with each degree of freedom: every frame places all bones, but holds the freedoms' values only.
+const MOST_STILL: usize = 16;
+
 #[derive(Debug, thiserror::Error)]
 pub enum AsfAmcError {
     #[error("cannot read {path}: {cause}")]
@@ -204,6 +207,11 @@ fn parse_asf(text: &str) -> Result<Skeleton, Fault> {
     let root =
         Bone { name: "root".into(), parent: None, vector: Vector3::zeros(), axis: UnitQuaternion::identity(), freedoms: root_freedoms };
     let bones = assemble(root, &bones, &children, degrees)?;
+    let freedoms = bones.iter().map(|b| b.freedoms.len()).sum::<usize>();
+    if bones.len() > MOST_STILL * (freedoms + 1) {
+        let what = format!("{} bones with only {freedoms} degrees of freedom in all are no skeleton of a recording", bones.len());
+        return Err((last_line, what));
+    }
     Ok(Skeleton { bones, root_order, metres_per_unit, degrees })
 }
 

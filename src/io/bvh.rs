@@ -33,6 +33,9 @@ pub fn read(path: &Path) -> Result<Recording, BvhError> {
     parse(&text).map_err(|(line, what)| BvhError::Syntax { path: path.into(), line, what })
 }
 
+/// Joints that may come with each channel: every frame places all joints, but its line holds the channels only.
+const MOST_STILL: usize = 16;
+
 /// Line (from 1) and what is wrong there.
 type Fault = (usize, String);
 
@@ -54,6 +57,11 @@ fn parse(text: &str) -> Result<Recording, Fault> {
     let motion = lines.iter().position(|l| l.trim().eq_ignore_ascii_case("motion"));
     let end = motion.ok_or((lines.len(), "the MOTION part is missing; the file is cut short".to_string()))?;
     let hierarchy = parse_hierarchy(&lines[..end])?;
+    let channels = hierarchy.channels.iter().map(Vec::len).sum::<usize>();
+    if hierarchy.joints.len() > MOST_STILL * (channels + 1) {
+        let what = format!("{} joints with only {channels} channels in all are no recording of a motion", hierarchy.joints.len());
+        return Err((1, what));
+    }
     let mut rest = lines.iter().enumerate().skip(end + 1).map(|(i, l)| (i + 1, l.trim())).filter(|(_, l)| !l.is_empty());
     let (declared, declared_line) = header(rest.next(), "Frames", lines.len())?;
     let (frame_time, line) = header(rest.next(), "Frame Time", lines.len())?;

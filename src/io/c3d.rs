@@ -199,7 +199,9 @@ pub(super) fn metres(unit: String) -> Option<f64> {
 
 fn layout(bytes: &Bytes, number: &dyn Fn(&str, usize) -> Option<f64>, notices: &mut Vec<String>) -> Result<Layout, String> {
     let header = |word: usize| bytes.word(2 * (word - 1)).map_or(0, usize::from);
-    let count = |name: &str| number(name, 0).map(|n| n as usize);
+    // Counts and places are words; floats of damaged files claim anything.
+    let word = |name: &str, index: usize| number(name, index).filter(|n| (0.0..65536.0).contains(n)).map(|n| n as usize);
+    let count = |name: &str| word(name, 0);
     let points = count("POINT:USED").unwrap_or(header(2));
     if points == 0 {
         return Err("holds no points (POINT:USED is 0): it is no marker recording".into());
@@ -211,7 +213,7 @@ fn layout(bytes: &Bytes, number: &dyn Fn(&str, usize) -> Option<f64>, notices: &
     }
     let samples = header(3);
     let frame_bytes = if scale > 0.0 { 8 * points + 2 * samples } else { 16 * points + 4 * samples };
-    let field = |name: &str| Some(number(name, 0)? as usize + 65536 * number(name, 1)? as usize);
+    let field = |name: &str| Some(word(name, 0)? + 65536 * word(name, 1)?);
     let trial = field("TRIAL:ACTUAL_START_FIELD").zip(field("TRIAL:ACTUAL_END_FIELD"));
     let of_header = (header(5) + 1).saturating_sub(header(4));
     let declared = trial

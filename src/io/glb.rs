@@ -8,13 +8,20 @@
 
 use std::path::{Path, PathBuf};
 
-use gltf::animation::Interpolation;
-use gltf::animation::util::ReadOutputs;
 use nalgebra::{Matrix4, Quaternion, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 
+use super::glb_tracks::motions;
 use super::write_atomic;
-use crate::animal::creature::{Bone, Creature, Local, Motion, Posture, Skin, Vertex};
+use crate::animal::creature::{Bone, Creature, Local, Motion, Skin, Vertex};
+
+/// Bytes of a GLB file's header.
+const HEADER: u32 = 12;
+/// Values of corners, key times, and places of bones that a byte of a file may stand for; most files have less than one.
+const UNFOLDED: usize = 16;
+/// Places of bones beyond that, for large skeletons of which little moves.
+const UNFOLDED_FREELY: usize = 1_000_000;
+const TOO_LARGE: &str = "its meshes or motions unfold to far more than its size; write what is repeated once";
 
 #[derive(Debug, thiserror::Error)]
 pub enum GlbError {
@@ -31,6 +38,11 @@ pub enum GlbError {
 /// Reads a creature with all its motions.
 pub fn read(path: &Path) -> Result<Creature, GlbError> {
     let bytes = std::fs::read(path).map_err(|cause| GlbError::Read { path: path.into(), cause })?;
+    // The crate takes the header's own size off the length without a look.
+    let length = bytes.first_chunk::<12>().map_or(u32::MAX, |h| u32::from_le_bytes([h[8], h[9], h[10], h[11]]));
+    if bytes.starts_with(b"glTF") && length < HEADER {
+        return Err(GlbError::Format { path: path.into(), why: "its header promises less than itself".into() });
+    }
     let file = gltf::Gltf::from_slice(&bytes).map_err(|e| GlbError::Format { path: path.into(), why: e.to_string() })?;
     let content = |what: &str| GlbError::Content { path: path.into(), what: what.into() };
     let blob = file.blob.as_deref().unwrap_or_default();
@@ -39,8 +51,12 @@ pub fn read(path: &Path) -> Result<Creature, GlbError> {
     if bones.is_empty() || bones.len() > usize::from(u16::MAX) {
         return Err(content("it holds no node, or too many"));
     }
+    if unfolded(&file.document) > UNFOLDED * bytes.len() {
+        return Err(content(TOO_LARGE));
+    }
     let skin = skin(&file.document, blob, bones.len(), &bone_of_node);
-    let motions = file.document.animations().filter_map(|a| motion(&a, blob, &bones, &bone_of_node)).collect();
+    let room = UNFOLDED * bytes.len() + UNFOLDED_FREELY;
+    let motions = motions(&file.document, blob, &bones, &bone_of_node, room).ok_or_else(|| content(TOO_LARGE))?;
     Ok(Creature { bones, skin, motions })
 }
 
@@ -55,18 +71,40 @@ fn check_extents(document: &gltf::Document, blob: &[u8]) -> Result<(), String> {
         }
     }
     for accessor in document.accessors() {
-        let Some(view) = accessor.view() else { continue };
-        let stride = view.stride().unwrap_or(accessor.size());
-        let reach = accessor
-            .count()
-            .saturating_sub(1)
-            .checked_mul(stride)
-            .and_then(|r| r.checked_add(accessor.size())?.checked_add(accessor.offset()));
-        if reach.is_none_or(|r| r > view.length()) {
-            return Err(format!("accessor {} reaches beyond its buffer view; the file is damaged", accessor.index()));
+        let beyond = || format!("accessor {} reaches beyond its buffer view; the file is damaged", accessor.index());
+        if let Some(sparse) = accessor.sparse() {
+            let (places, values) = (sparse.indices(), sparse.values());
+            let fits = reaches(sparse.count(), &places.view(), places.offset(), places.index_type().size())
+                && reaches(sparse.count(), &values.view(), values.offset(), accessor.size());
+            if !fits {
+                return Err(beyond());
+            }
+        }
+        let fits = match accessor.view() {
+            Some(view) => reaches(accessor.count(), &view, accessor.offset(), accessor.size()),
+            None => accessor.count() <= blob.len(),
+        };
+        if accessor.count() == 0 || !fits {
+            return Err(beyond());
         }
     }
     Ok(())
+}
+
+/// Whether so many items lie within a buffer view.
+fn reaches(count: usize, view: &gltf::buffer::View, offset: usize, size: usize) -> bool {
+    let stride = view.stride().unwrap_or(size);
+    let reach = count.saturating_sub(1).checked_mul(stride).and_then(|r| r.checked_add(size)?.checked_add(offset));
+    reach.is_some_and(|r| r <= view.length())
+}
+
+/// Nodes may share meshes and skins, and channels key times: values, joints and keys that the file unfolds to, before any is read.
+fn unfolded(document: &gltf::Document) -> usize {
+    let values = |p: gltf::Primitive| p.attributes().map(|(_, a)| a).chain(p.indices()).map(|a| a.count()).fold(0, usize::saturating_add);
+    let drawn = document.nodes().filter_map(|node| node.mesh()).flat_map(|mesh| mesh.primitives()).map(values);
+    let joints = document.nodes().filter_map(|node| node.skin()).map(|skin| skin.joints().count());
+    let keys = document.animations().flat_map(|a| a.channels()).map(|c| c.sampler().input().count());
+    drawn.chain(joints).chain(keys).fold(0, usize::saturating_add)
 }
 
 /// Whether a node only holds a skinned mesh, which moves with its joints: such nodes are no bones.
@@ -103,11 +141,11 @@ fn bones(document: &gltf::Document) -> Option<(Vec<Bone>, Vec<usize>)> {
     (bones.len() + holders == count).then_some((bones, place))
 }
 
-fn vector(v: [f32; 3]) -> Vector3<f64> {
+pub(super) fn vector(v: [f32; 3]) -> Vector3<f64> {
     Vector3::from(v.map(f64::from))
 }
 
-fn quaternion(q: [f32; 4]) -> UnitQuaternion<f64> {
+pub(super) fn quaternion(q: [f32; 4]) -> UnitQuaternion<f64> {
     let [x, y, z, w] = q.map(f64::from);
     UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12).unwrap_or_default()
 }
@@ -115,9 +153,11 @@ fn quaternion(q: [f32; 4]) -> UnitQuaternion<f64> {
 fn skin(document: &gltf::Document, blob: &[u8], bones: usize, place: &[usize]) -> Skin {
     let mut skin = Skin { bone_from_mesh: vec![Matrix4::identity(); bones], ..Skin::default() };
     let mut bound = vec![false; bones];
+    // A holder of a skin is no bone, whoever names it as a joint; its vertices go with the first one.
+    let bone = |node: usize| if place[node] < bones { place[node] } else { 0 };
     for node in document.nodes() {
         let Some(mesh) = node.mesh() else { continue };
-        let joints: Vec<usize> = node.skin().map_or_else(|| vec![place[node.index()]], |s| s.joints().map(|j| place[j.index()]).collect());
+        let joints: Vec<usize> = node.skin().map_or_else(|| vec![bone(node.index())], |s| s.joints().map(|j| bone(j.index())).collect());
         let mut binds: Vec<Matrix4<f64>> = vec![Matrix4::identity(); joints.len()];
         if let Some(read) = node.skin().and_then(|s| s.reader(|_| Some(blob)).read_inverse_bind_matrices().map(|m| m.collect::<Vec<_>>())) {
             binds.iter_mut().zip(read).for_each(|(b, m)| *b = Matrix4::from_fn(|r, c| f64::from(m[c][r])));
@@ -162,82 +202,6 @@ fn primitive(primitive: &gltf::Primitive, blob: &[u8], joints: &[usize], binds: 
 /// Colours of glTF are linear.
 fn srgb(linear: f32) -> u8 {
     (linear.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8
-}
-
-/// Values of one channel at its key times; for cubic splines in-tangent, value, out-tangent.
-struct Track {
-    times: Vec<f64>,
-    values: Vec<[f64; 4]>,
-    interpolation: Interpolation,
-    turns: bool,
-}
-
-impl Track {
-    fn at(&self, time: f64) -> [f64; 4] {
-        let knots = self.times.len();
-        let next = self.times.partition_point(|t| *t <= time);
-        let cubic = self.interpolation == Interpolation::CubicSpline;
-        let value = |k: usize| self.values[if cubic { 3 * k + 1 } else { k }];
-        if next == 0 || next >= knots || self.interpolation == Interpolation::Step {
-            return value(next.saturating_sub(1).min(knots - 1));
-        }
-        let span = self.times[next] - self.times[next - 1];
-        let t = (time - self.times[next - 1]) / span;
-        let (a, b) = (value(next - 1), value(next));
-        if cubic {
-            let (out, into) = (self.values[3 * (next - 1) + 2], self.values[3 * next]);
-            let (t2, t3) = (t * t, t * t * t);
-            let weights = [2.0 * t3 - 3.0 * t2 + 1.0, span * (t3 - 2.0 * t2 + t), 3.0 * t2 - 2.0 * t3, span * (t3 - t2)];
-            return [0, 1, 2, 3].map(|k| weights[0] * a[k] + weights[1] * out[k] + weights[2] * b[k] + weights[3] * into[k]);
-        }
-        if self.turns {
-            let q = |v: [f64; 4]| UnitQuaternion::new_normalize(Quaternion::new(v[3], v[0], v[1], v[2]));
-            let turned = q(a).try_slerp(&q(b), t, 1e-12).unwrap_or(q(a));
-            return [turned.i, turned.j, turned.k, turned.w];
-        }
-        [0, 1, 2, 3].map(|k| a[k] + (b[k] - a[k]) * t)
-    }
-}
-
-fn motion(animation: &gltf::Animation, blob: &[u8], bones: &[Bone], place: &[usize]) -> Option<Motion> {
-    let mut tracks: Vec<(usize, usize, Track)> = Vec::new();
-    for channel in animation.channels() {
-        let reader = channel.reader(|_| Some(blob));
-        let times: Vec<f64> = reader.read_inputs()?.map(f64::from).collect();
-        let pad = |v: [f32; 3]| [v[0], v[1], v[2], 0.0].map(f64::from);
-        let (kind, values): (usize, Vec<[f64; 4]>) = match reader.read_outputs()? {
-            ReadOutputs::Translations(v) => (0, v.map(pad).collect()),
-            ReadOutputs::Rotations(v) => (1, v.into_f32().map(|q| q.map(f64::from)).collect()),
-            ReadOutputs::Scales(v) => (2, v.map(pad).collect()),
-            ReadOutputs::MorphTargetWeights(_) => continue,
-        };
-        let interpolation = channel.sampler().interpolation();
-        let each = if interpolation == Interpolation::CubicSpline { 3 } else { 1 };
-        let sound = times.windows(2).all(|w| w[0] < w[1]) && times.iter().all(|t| t.is_finite());
-        let known = place[channel.target().node().index()] != usize::MAX;
-        if known && !times.is_empty() && sound && values.len() == each * times.len() {
-            tracks.push((place[channel.target().node().index()], kind, Track { times, values, interpolation, turns: kind == 1 }));
-        }
-    }
-    let mut times_s: Vec<f64> = tracks.iter().flat_map(|t| t.2.times.iter().copied()).collect();
-    times_s.sort_by(f64::total_cmp);
-    times_s.dedup_by(|b, a| (*b - *a).abs() < 1e-5);
-    let posture = |time: &f64| {
-        let mut posture: Posture = bones.iter().map(|b| b.rest).collect();
-        for (bone, kind, track) in &tracks {
-            let v = track.at(*time);
-            let xyz = Vector3::new(v[0], v[1], v[2]);
-            match kind {
-                0 => posture[*bone].translation = xyz,
-                1 => posture[*bone].rotation = quaternion(v.map(|c| c as f32)),
-                _ => posture[*bone].scale = xyz,
-            }
-        }
-        posture
-    };
-    let postures = times_s.iter().map(posture).collect();
-    let name = animation.name().map_or_else(|| format!("animation_{}", animation.index()), String::from);
-    (!times_s.is_empty()).then_some(Motion { name, times_s, postures })
 }
 
 /// Writes a creature with all its motions.

@@ -4,15 +4,18 @@
 //! EOI (FF D9) for JPEG, the IEND chunk for PNG, each with nothing but padding after it.
 //! Colour becomes Y = 0.299 R + 0.587 G + 0.114 B as in OpenCV, against which the decoding is checked.
 
-use image::{DynamicImage, GrayImage, ImageFormat};
+use image::{DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader};
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 const PNG_END: [u8; 8] = *b"IEND\xae\x42\x60\x82";
 const JPEG_END: [u8; 2] = [0xff, 0xd9];
 /// Padding after the end of a picture that is still looked through, bytes.
 const LONGEST_PADDING: u64 = 4096;
+
+/// More bytes of pixels than this come from no byte of a file: deflate makes 1032 of one, JPEG a block from a bit.
+const UNPACKED: u64 = 1100;
 
 /// Why a picture cannot be used; every message names the file.
 #[derive(Debug, thiserror::Error)]
@@ -45,8 +48,14 @@ pub fn read_any(path: &Path) -> Result<DynamicImage, ImageError> {
     if !ends_whole(&bytes, format) {
         return Err(ImageError::Truncated { path: path.into() });
     }
-    let damaged = |e: image::ImageError| ImageError::Damaged { path: path.into(), message: e.to_string().replace('\n', ", ") };
-    image::load_from_memory_with_format(&bytes, format).map_err(damaged)
+    let damaged = |message: String| ImageError::Damaged { path: path.into(), message };
+    let failed = |e: image::ImageError| damaged(e.to_string().replace('\n', ", "));
+    let decoder = ImageReader::with_format(Cursor::new(&bytes), format).into_decoder().map_err(failed)?;
+    if decoder.total_bytes() > UNPACKED * bytes.len() as u64 {
+        let (width, height) = decoder.dimensions();
+        return Err(damaged(format!("{} bytes cannot hold the {width}x{height} pixels that it promises", bytes.len())));
+    }
+    DynamicImage::from_decoder(decoder).map_err(failed)
 }
 
 /// Looks at the first and last bytes of a picture only, and refuses one that is no picture or has lost its end.
@@ -170,5 +179,28 @@ mod tests {
         std::fs::write(&path, "no picture").unwrap();
         assert!(read_grey(&path).unwrap_err().to_string().contains("a.png: is neither"));
         assert!(matches!(read_grey(&folder.path().join("b.png")), Err(ImageError::Read { .. })));
+    }
+
+    /// A header is changed with its checksum; what follows are the pixels of a small picture.
+    #[test]
+    fn a_header_that_promises_more_than_the_file_can_hold_takes_no_room() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let whole = GrayImage::from_pixel(2000, 1500, image::Luma([7]));
+        whole.save(&path).unwrap();
+        assert_eq!(read_grey(&path).unwrap(), whole, "an even picture packs best of all");
+        let mut bytes = std::fs::read(&path).unwrap();
+        bytes[16..24].copy_from_slice(&[0, 0, 0x75, 0x30, 0, 0, 0x42, 0x68]);
+        let check = crc(&bytes[12..29]);
+        bytes[29..33].copy_from_slice(&check.to_be_bytes());
+        std::fs::write(&path, &bytes).unwrap();
+        let error = read_grey(&path).unwrap_err().to_string();
+        assert!(error.contains("cannot hold the 30000x17000 pixels that it promises"), "{error}");
+    }
+
+    /// PNG's checksum (CRC-32).
+    fn crc(bytes: &[u8]) -> u32 {
+        let step = |c: u32, _| if c & 1 == 1 { 0xedb8_8320 ^ (c >> 1) } else { c >> 1 };
+        !bytes.iter().fold(!0u32, |c, b| (0..8).fold(c ^ u32::from(*b), step))
     }
 }

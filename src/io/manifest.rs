@@ -1,12 +1,12 @@
 //! Which motion files make a database: folders searched, and `subjects.csv` that says what the files hold.
 //!
 //! Columns `file,subject,activity,speed_m_s,length_m,start_s,end_s` in any order, all but `file` optional, empty cells
-//! allowed; `file` is relative to the manifest. A file may have several rows. A `subjects.csv` found in a folder stands for
+//! allowed; `file` is relative to the manifest, and below its folder in a manifest that was found there and not named. A file may have several rows. A `subjects.csv` found in a folder stands for
 //! the whole folder: only the files it lists are used. A trial that lies in one folder as C3D and as TRC counts once.
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use super::is_motion_file;
 use super::outputs_json::Outputs;
@@ -69,7 +69,7 @@ fn search(path: &Path, entries: &mut Vec<Entry>, seen: &mut BTreeSet<PathBuf>) -
         return Ok(());
     }
     if path.join(MANIFEST).is_file() {
-        entries.extend(read_manifest(&path.join(MANIFEST))?);
+        entries.extend(read_rows(&path.join(MANIFEST), true)?);
         return Ok(());
     }
     let mut children: Vec<PathBuf> = fs::read_dir(path).map_err(failed)?.filter_map(|e| Some(e.ok()?.path())).collect();
@@ -116,6 +116,11 @@ fn subject_of(path: &Path) -> Option<String> {
 
 /// The rows of a `subjects.csv`.
 pub fn read_manifest(path: &Path) -> Result<Vec<Entry>, ManifestError> {
+    read_rows(path, false)
+}
+
+/// `found`: in a folder, perhaps with data from elsewhere; its files must lie there.
+fn read_rows(path: &Path, found: bool) -> Result<Vec<Entry>, ManifestError> {
     let text = fs::read_to_string(path).map_err(|cause| ManifestError::Read { path: path.to_path_buf(), cause })?;
     let mut lines = text.trim_start_matches('\u{feff}').lines();
     let columns: Vec<String> = cells(lines.next().unwrap_or_default());
@@ -128,7 +133,7 @@ pub fn read_manifest(path: &Path) -> Result<Vec<Entry>, ManifestError> {
     }
     let mut entries = Vec::new();
     for (i, line) in lines.enumerate().filter(|(_, l)| !l.trim().is_empty()) {
-        let entry = row(path, &columns, &cells(line));
+        let entry = row(path, found, &columns, &cells(line));
         entries.push(entry.map_err(|why| ManifestError::Row { path: path.to_path_buf(), line: i + 2, why })?);
     }
     Ok(entries)
@@ -138,7 +143,7 @@ fn cells(line: &str) -> Vec<String> {
     line.split(',').map(|c| c.trim().trim_matches('"').to_string()).collect()
 }
 
-fn row(manifest: &Path, columns: &[String], cells: &[String]) -> Result<Entry, String> {
+fn row(manifest: &Path, found: bool, columns: &[String], cells: &[String]) -> Result<Entry, String> {
     if cells.len() > columns.len() {
         return Err(format!("has {} cells, the header {}", cells.len(), columns.len()));
     }
@@ -151,6 +156,9 @@ fn row(manifest: &Path, columns: &[String], cells: &[String]) -> Result<Entry, S
         cell(name).map(|c| parse(c).ok_or(format!("{name} is `{c}`, not a number from 0 on"))).transpose()
     };
     let file = cell("file").ok_or("names no file")?;
+    if found && !Path::new(file).components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir)) {
+        return Err(format!("`{file}` lies outside the manifest's folder; name the manifest with --manifest if that is meant"));
+    }
     let path = manifest.parent().unwrap_or(Path::new("")).join(file);
     if !path.is_file() {
         return Err(format!("{} does not exist", path.display()));
@@ -221,6 +229,19 @@ mod tests {
         assert_eq!(found.len(), 2);
         assert_eq!((found[0].subject.as_str(), found[0].activity, found[0].parameter), ("s1", Some(Activity::Running), Some(3.0)));
         assert_eq!((found[1].subject.as_str(), found[1].start_s, found[1].end_s), ("s2", Some(0.5), Some(2.0)));
+    }
+
+    #[test]
+    fn a_manifest_that_was_found_leads_nowhere_else_and_one_that_was_named_may() {
+        let dir = folder(&[("w.bvh", ""), ("data/in/a.bvh", "")]);
+        let data = dir.path().join("data");
+        let outside = dir.path().join("w.bvh");
+        for (file, inside) in [("../w.bvh", false), ("in/../../w.bvh", false), (outside.to_str().unwrap(), false), ("./in/a.bvh", true)] {
+            fs::write(data.join(MANIFEST), format!("file\n{file}\n")).unwrap();
+            let found = find_motions(std::slice::from_ref(&data), None).map_err(|e| e.to_string());
+            assert_eq!(found.is_ok(), inside, "{file}: {found:?}");
+            assert!(inside || found.unwrap_err().contains("line 2: ") && find_motions(&[], Some(&data.join(MANIFEST))).is_ok());
+        }
     }
 
     #[test]

@@ -17,6 +17,7 @@ pub mod fit_json;
 pub mod frame_cloud;
 pub mod gait_csv;
 pub mod glb;
+mod glb_tracks;
 pub mod images;
 pub mod joints_csv;
 mod kalibr;
@@ -43,7 +44,7 @@ pub mod style_json;
 pub mod trc;
 pub mod video;
 
-pub use atomic::write_atomic;
+pub use atomic::{with_remedy, write_atomic};
 pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};
 pub use opencv_yml::write_opencv_rig;
 pub use rig_files::{ReadRig, RigFileError, RigReading, read_rig_files};

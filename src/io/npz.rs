@@ -1,14 +1,22 @@
 //! What model and space files have in common: `.npz` archives of `f64` arrays with a JSON header, hashed, checked.
 
-use std::io::{BufReader, Cursor, Read, Seek};
+use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 
 use nalgebra::{Quaternion, UnitQuaternion};
-use npyz::WriterBuilder;
-use npyz::npz::{NpzArchive, NpzWriter};
+use npyz::npz::NpzWriter;
+use npyz::{NpyFile, WriterBuilder};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use zip::ZipArchive;
+use zip::result::ZipError;
 
 use crate::body::{BALL_JOINTS, Joint};
+
+/// Bytes that one of the archive may unpack to, besides the first million: numpy's compressed zeros take a thousandth, nobody's
+/// motions less than a tenth.
+const UNPACKED: u64 = 100;
+/// Of an array's description, Python's words for shape and type; numpy's are 128 bytes long.
+const LONGEST_DESCRIPTION: usize = 1024;
 
 pub const SKELETON: &str = "muybridge-hanim-78";
 
@@ -67,21 +75,39 @@ pub fn archive(header: &impl Serialize, arrays: Vec<Array>) -> std::io::Result<V
     Ok(cursor.into_inner())
 }
 
-pub struct Reader<R: Read + Seek>(NpzArchive<BufReader<R>>);
+pub struct Reader<R: Read + Seek> {
+    archive: ZipArchive<BufReader<R>>,
+    /// Bytes that an entry may unpack to.
+    limit: u64,
+}
 
 impl<R: Read + Seek> Reader<R> {
-    pub fn new(file: R) -> Result<Reader<R>, Fault> {
-        NpzArchive::new(BufReader::new(file)).map(Reader).map_err(|e| Fault::Foreign(format!("not an .npz archive: {e}")))
+    pub fn new(mut file: R) -> Result<Reader<R>, Fault> {
+        let foreign = |why: String| Fault::Foreign(format!("not an .npz archive: {why}"));
+        let length = file.seek(SeekFrom::End(0)).and_then(|length| file.rewind().map(|()| length)).map_err(|e| foreign(e.to_string()))?;
+        let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| foreign(e.to_string()))?;
+        Ok(Reader { archive, limit: 1_000_000 + UNPACKED * length })
+    }
+
+    /// The bytes of an array's file; `None` where there is none.
+    fn entry(&mut self, name: &str) -> Result<Option<Vec<u8>>, String> {
+        let entry = match self.archive.by_name(&format!("{name}.npy")) {
+            Ok(entry) => entry,
+            Err(ZipError::FileNotFound) => return Ok(None),
+            Err(error) => return Err(error.to_string()),
+        };
+        let mut bytes = Vec::new();
+        entry.take(self.limit + 1).read_to_end(&mut bytes).map_err(|e| e.to_string())?;
+        if bytes.len() as u64 > self.limit {
+            return Err(format!("it unpacks to more than {UNPACKED} times the archive's size"));
+        }
+        Ok(Some(bytes))
     }
 
     /// The header of this format, version and skeleton.
     pub fn header<H: DeserializeOwned>(&mut self, format: &str, version: u32) -> Result<H, Fault> {
-        let bytes = match self.0.by_name("header") {
-            Ok(Some(array)) => array.into_vec::<u8>().map_err(|e| e.to_string()),
-            Ok(None) => Err("it holds no array `header`".to_string()),
-            Err(e) => Err(e.to_string()),
-        };
-        let bytes = bytes.map_err(Fault::Foreign)?;
+        let entry = self.entry("header").and_then(|entry| entry.ok_or("it holds no array `header`".into()));
+        let bytes = entry.and_then(|entry| numbers::<u8>(&entry)).map_err(Fault::Foreign)?.1;
         let value: serde_json::Value = serde_json::from_slice(&bytes).map_err(|_| Fault::Foreign("its header is no JSON".into()))?;
         if value["format"] != format {
             return Err(Fault::Foreign("its header names another format".into()));
@@ -102,25 +128,48 @@ impl<R: Read + Seek> Reader<R> {
 
     /// An array of finite numbers with `columns` values per row (0 for a plain vector) and its number of rows.
     pub fn array(&mut self, name: &'static str, columns: usize) -> Result<(usize, Vec<f64>), Fault> {
-        let read = match self.0.by_name(name) {
-            Ok(Some(array)) => {
-                let shape = array.shape().to_vec();
-                let fits = if columns == 0 { shape.len() == 1 } else { shape.len() == 2 && shape[1] == columns as u64 };
-                if fits {
-                    array.into_vec::<f64>().map(|v| (shape[0] as usize, v)).map_err(|e| e.to_string())
-                } else {
-                    Err(format!("shape {shape:?}"))
-                }
-            }
-            Ok(None) => Err("missing".to_string()),
-            Err(e) => Err(e.to_string()),
-        };
+        let found = self.entry(name).and_then(|entry| entry.ok_or("missing".into())).and_then(|entry| numbers::<f64>(&entry));
+        let read = found.and_then(|(shape, values)| match shape[..] {
+            [rows] if columns == 0 => Ok((rows, values)),
+            [rows, found] if columns > 0 && found == columns => Ok((rows, values)),
+            _ => Err(format!("shape {shape:?}")),
+        });
         let (rows, values) = read.map_err(|e| Fault::Damaged(format!("array `{name}`: {e}")))?;
         if values.len() != rows * columns.max(1) || values.iter().any(|v| !v.is_finite()) {
             return Err(Fault::Damaged(format!("array `{name}` is cut short or not finite")));
         }
         Ok((rows, values))
     }
+}
+
+/// Shape and values of a `.npy` file, in C order. What its description promises is compared with its length first.
+fn numbers<T: npyz::Deserialize>(bytes: &[u8]) -> Result<(Vec<usize>, Vec<T>), String> {
+    const CUT: &str = "it is cut short";
+    let start = match bytes.get(6).ok_or(CUT)? {
+        1 => 10,
+        _ => 12,
+    };
+    let length = bytes.get(8..start).ok_or(CUT)?.iter().rev().fold(0, |sum, b| 256 * sum + usize::from(*b));
+    let description = bytes.get(start..start + length.min(LONGEST_DESCRIPTION + 1)).ok_or(CUT)?;
+    if length > LONGEST_DESCRIPTION || description.iter().filter(|b| b"([{".contains(b)).count() > 8 {
+        return Err("its description is not numpy's".into());
+    }
+    let promised = shape_of(description).ok_or("its description names no shape that fits its length")?;
+    if promised.iter().try_fold(1usize, |n, k| n.checked_mul(*k)).is_none_or(|n| n > bytes.len()) {
+        return Err(CUT.into());
+    }
+    let file = NpyFile::new(bytes).map_err(|e| e.to_string())?;
+    let shape = file.shape().iter().map(|n| *n as usize).collect();
+    Ok((shape, file.into_vec().map_err(|e| e.to_string())?))
+}
+
+/// The numbers behind `shape` in an array's description.
+fn shape_of(description: &[u8]) -> Option<Vec<usize>> {
+    let text = std::str::from_utf8(description).ok()?;
+    let (_, after) = text.split_once("shape")?;
+    let (_, inside) = after.split_once('(')?;
+    let words = inside.split(')').next()?.split(',').map(|word| word.trim().trim_end_matches('L'));
+    words.filter(|word| !word.is_empty()).map(|word| word.parse().ok()).collect()
 }
 
 /// The 26 quaternions of an array of rows w x y z.

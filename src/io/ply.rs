@@ -55,11 +55,14 @@ pub fn read_ply(path: &Path) -> Result<Cloud, PlyError> {
     Ok(Cloud { points })
 }
 
-/// A header that promises more vertices than bytes follow must not make the parser reserve memory for them.
+/// A header that promises more vertices than bytes follow, or a list that does, must not make the parser reserve memory for them.
 fn check_length(bytes: &[u8]) -> Result<(), String> {
     const END: &[u8] = b"end_header";
     let end = bytes.windows(END.len()).position(|w| w == END).ok_or("its header has no end_header")?;
     let header = std::str::from_utf8(&bytes[..end]).map_err(|_| "its header is not text")?;
+    if header.lines().any(|l| l.split_whitespace().take(2).eq(["property", "list"])) {
+        return Err("it holds lists (faces), a cloud has none; save the vertices alone".into());
+    }
     let promised: u64 =
         header.lines().filter_map(|l| l.strip_prefix("element")?.split_whitespace().nth(1)?.parse::<u64>().ok()).max().unwrap_or(0);
     let rest = (bytes.len() - end) as u64;

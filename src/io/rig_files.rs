@@ -10,7 +10,7 @@ use super::images;
 use super::kalibr;
 use super::opencv_yml;
 use super::video::{self, Video};
-use crate::rig::{Rig, RigError, Up};
+use crate::rig::{Rig, RigError, Up, is_file_name};
 use nalgebra::{Matrix3, Rotation3};
 use std::path::{Path, PathBuf};
 
@@ -34,6 +34,8 @@ pub enum RigFileError {
     NotAPair { first: PathBuf, second: PathBuf },
     #[error("{}: is not what OpenCV writes: {message}", path.display())]
     Storage { path: PathBuf, message: String },
+    #[error("{}: is nested deeper than any rig; write it again with the tool that calibrated the cameras", path.display())]
+    Nested { path: PathBuf },
     #[error("{}: is not YAML: {message}", path.display())]
     Yaml { path: PathBuf, message: String },
     #[error("{}: has no `{key}`; it must be {expected}", path.display())]
@@ -164,6 +166,9 @@ fn camera_chain(folder: &Path) -> Option<PathBuf> {
 fn find(files: &[PathBuf], reading: &RigReading) -> Result<Found, RigFileError> {
     let read = |path: &PathBuf| std::fs::read_to_string(path).map_err(|error| RigFileError::Read { path: path.clone(), error });
     let texts = files.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    if let Some(deep) = texts.iter().position(|text| is_deep(text)) {
+        return Err(RigFileError::Nested { path: files[deep].clone() });
+    }
     if texts.iter().all(|text| opencv_yml::is_storage(text)) {
         return opencv_yml::find(files, &texts, reading);
     }
@@ -180,6 +185,29 @@ fn find(files: &[PathBuf], reading: &RigReading) -> Result<Found, RigFileError> 
     }
     let rig = calib_toml::parse_unchecked(text, path)?;
     Ok(Found { read: ReadRig { rig, form: "Calib.toml", notices: Vec::new() }, camera_world: false })
+}
+
+/// Levels of lists, tags or blanks that no rig has. OpenCV's parser, which calls itself for every level, runs out of stack, and
+/// YAML's takes a minute for a hundred thousand.
+const DEEPEST: usize = 100;
+
+fn is_deep(text: &str) -> bool {
+    let tags = text.trim_start().starts_with('<');
+    let (mut depth, mut before) = (0usize, ' ');
+    for c in text.chars() {
+        match (before, c) {
+            (_, '[' | '{') => depth += 1,
+            (_, ']' | '}') => depth = depth.saturating_sub(1),
+            ('<', '/') | ('/', '>') if tags => depth = depth.saturating_sub(1),
+            ('<', _) if tags && c.is_alphabetic() => depth += 1,
+            _ => {}
+        }
+        if depth > DEEPEST {
+            return true;
+        }
+        before = c;
+    }
+    text.lines().any(|line| line.len() - line.trim_start().len() > DEEPEST && !line.trim().is_empty())
 }
 
 /// Whether a text that is not a rig in TOML looks like another tool's rig file.
@@ -203,7 +231,8 @@ fn size_in(place: &Path, camera: &str) -> Option<[u32; 2]> {
         paths
     };
     let named = listed(place).into_iter().filter(|path| path.file_stem().is_some_and(|stem| stem == camera) && path.is_file());
-    listed(&place.join(camera)).into_iter().chain(named).find_map(|path| file_size(&path))
+    let own = is_file_name(camera).then(|| place.join(camera));
+    own.iter().flat_map(|folder| listed(folder)).chain(named).find_map(|path| file_size(&path))
 }
 
 fn file_size(path: &Path) -> Option<[u32; 2]> {

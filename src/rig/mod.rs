@@ -48,6 +48,10 @@ const WIDEST_STEREO_ANGLE_DEG: f64 = 45.0;
 pub enum RigError {
     #[error("the rig has no camera")]
     NoCameras,
+    #[error("the camera name {name:?} cannot be the name of a file; use letters, digits, _ and -")]
+    Name { name: String },
+    #[error("two cameras are called {name}; give each a name of its own")]
+    SameName { name: String },
     #[error("{camera}: {what} holds a number that is not finite; calibrate this camera again")]
     NotFinite { camera: String, what: &'static str },
     #[error("{camera}: the image size {width}x{height} px is impossible; write the size of the pictures in pixels")]
@@ -82,6 +86,15 @@ pub enum RigError {
     ViewsApart { first: String, second: String, angle_deg: f64 },
 }
 
+/// Names of files end at 255 bytes; ours have something before and behind the camera's.
+const LONGEST_NAME: usize = 100;
+
+/// Whether a camera's name is one visible file name wherever it is put, and never a way out of a folder.
+pub fn is_file_name(name: &str) -> bool {
+    let hidden = name.is_empty() || name.starts_with('.');
+    !hidden && name.len() <= LONGEST_NAME && !name.contains(|c: char| c.is_control() || matches!(c, '/' | '\\' | ':'))
+}
+
 impl Rig {
     /// Distances between camera centres, metres, as (camera, later camera, distance).
     pub fn baselines_m(&self) -> Vec<(usize, usize, f64)> {
@@ -94,6 +107,7 @@ impl Rig {
         if self.cameras.is_empty() {
             return Err(RigError::NoCameras);
         }
+        self.validate_names()?;
         self.cameras.iter().try_for_each(validate_camera)?;
         let baselines = self.baselines_m();
         let name = |i: usize| self.cameras[i].name.clone();
@@ -108,6 +122,19 @@ impl Rig {
             Some(&(i, k, _)) => Err(RigError::SamePlace { first: name(i), second: name(k) }),
             None => Ok(()),
         }
+    }
+
+    /// Folders, pictures and keys are named after cameras, and the names come from files.
+    fn validate_names(&self) -> Result<(), RigError> {
+        for (i, Camera { name, .. }) in self.cameras.iter().enumerate() {
+            if !is_file_name(name) {
+                return Err(RigError::Name { name: name.chars().take(LONGEST_NAME).collect() });
+            }
+            if self.cameras[..i].iter().any(|c| c.name == *name) {
+                return Err(RigError::SameName { name: name.clone() });
+            }
+        }
+        Ok(())
     }
 
     /// The same rig in another world: upright as the first camera stands, x to its right, horizontally away from it along y

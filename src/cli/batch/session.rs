@@ -5,7 +5,7 @@
 //! succeeds that folder's outputs and the status `done` become the session's results by one rename.
 
 use std::fs::{File, TryLockError};
-use std::io::{Read, Seek};
+use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -13,10 +13,11 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use muybridge::io::status_json::{self, Key, State, Status};
+use muybridge::io::{with_remedy, write_atomic};
 
 use super::study::{Plan, Study, StudySession};
 use crate::cli::track::{self, TrackArgs};
-use crate::cli::{executable, interrupt};
+use crate::cli::{executable, interrupt, whole};
 
 /// How often the supervisor looks at its worker; longer waits leave cores idle after short sessions.
 const GLANCE: Duration = Duration::from_millis(5);
@@ -51,9 +52,10 @@ pub fn settle(study: &Study, session: &StudySession, threads: usize) -> Result<E
         }
         let begun = begin(study, session, &key)?;
         match work(study, session, &log, threads, begun)? {
-            Some(Ended::Done(status)) if study.key(session) != key => drop(status),
-            Some(ended) => return Ok(ended),
             None => return Ok(Ended::Interrupted),
+            // What changed meanwhile may be why it failed, and what it failed on is not there any more.
+            Some(_) if study.key(session) != key => {}
+            Some(ended) => return Ok(ended),
         }
     }
     bail!("{}: changes while it is worked on; run the same command again when all is copied", session.folder.display())
@@ -62,8 +64,8 @@ pub fn settle(study: &Study, session: &StudySession, threads: usize) -> Result<E
 /// The open log under an exclusive lock; `None` where another process has it. File systems without locks do without.
 fn lock(path: &Path) -> Result<Option<File>> {
     let failed = || format!("cannot write {}", path.display());
-    std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).with_context(failed)?;
-    let log = File::options().create(true).read(true).append(true).open(path).with_context(failed)?;
+    whole::create(path.parent().unwrap_or(Path::new(".")))?;
+    let log = File::options().create(true).read(true).append(true).open(path).map_err(with_remedy).with_context(failed)?;
     match log.try_lock() {
         Ok(()) => Ok(Some(log)),
         Err(TryLockError::WouldBlock) => Ok(None),
@@ -77,8 +79,7 @@ fn lock(path: &Path) -> Result<Option<File>> {
 /// Moves earlier results away and says that the session runs.
 fn begin(study: &Study, session: &StudySession, key: &Key) -> Result<Status> {
     let (result, work) = (study.result(&session.name), study.work(&session.name));
-    let failed = || format!("cannot write {}", work.display());
-    std::fs::create_dir_all(&work).with_context(failed)?;
+    whole::create(&work)?;
     retire(&result, &work)?;
     let seconds = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let status = Status {
@@ -111,7 +112,7 @@ fn work(study: &Study, session: &StudySession, log: &File, threads: usize, begun
     if out.exists() {
         std::fs::remove_dir_all(&out).with_context(|| format!("cannot remove {}", out.display()))?;
     }
-    log.set_len(0).with_context(|| format!("cannot write {}", study.log(&session.name).display()))?;
+    head(log, session).map_err(with_remedy).with_context(|| format!("cannot write {}", study.log(&session.name).display()))?;
     let clock = Instant::now();
     let worker = start(session, &work, log, threads)?;
     let Some(exit) = wait(worker)? else {
@@ -133,9 +134,16 @@ fn work(study: &Study, session: &StudySession, log: &File, threads: usize, begun
     let folder = session.folder.display().to_string();
     let reason = reason.replace(&format!("{folder}: "), "").replace(&format!("{folder}/"), "");
     let status = Status { state: State::Failed, reason: Some(reason), ..ended };
-    status_json::write(&result, &status)?;
+    // In this order: where the disk is full it makes the room for the status.
     std::fs::remove_dir_all(&work).with_context(|| format!("cannot remove {}", work.display()))?;
+    status_json::write(&result, &status)?;
     Ok(Some(Ended::Failed(status)))
+}
+
+/// Begins the log anew. On a disk that fills up later the block of these lines still takes the worker's reason.
+fn head(mut log: &File, session: &StudySession) -> std::io::Result<()> {
+    log.set_len(0)?;
+    writeln!(log, "muybridge {}, {}", env!("CARGO_PKG_VERSION"), session.folder.display())
 }
 
 /// The worker: this program with [`WorkerArgs`].
@@ -212,7 +220,7 @@ pub fn worker(args: &WorkerArgs) -> Result<()> {
     end_with_the_supervisor();
     track::run(&TrackArgs::of(&args.session, args.work.join("out"), args.work.clone()))?;
     let path = args.work.join(MEMORY_FILE);
-    std::fs::write(&path, peak_memory_mb().map_or(String::new(), |mb| mb.to_string()))
+    write_atomic(&path, peak_memory_mb().map_or(String::new(), |mb| mb.to_string()).as_bytes())
         .with_context(|| format!("cannot write {}", path.display()))
 }
 

@@ -142,7 +142,9 @@ impl Study {
     /// Where a session stands, by its status file and its lock.
     pub fn status(&self, session: &StudySession) -> Status {
         let never = || Status::pending(&session.name, &session.folder, &Key::default());
-        let status = status_json::read(&self.result(&session.name)).unwrap_or_else(never);
+        // Names and places are the study's, whatever the file says.
+        let here = |status| Status { session: session.name.clone(), folder: session.folder.clone(), ..status };
+        let status = status_json::read(&self.result(&session.name)).map_or_else(never, here);
         if status.state == State::Running && !self.is_busy(&session.name) {
             let reason = "interrupted: killed, out of memory or out of time; run the same command to go on";
             return Status { state: State::Pending, reason: Some(reason.into()), ..status };
