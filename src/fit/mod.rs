@@ -3,10 +3,11 @@
 //! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]) → root, phases, weights, shape by
 //! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart,
 //! then with more components and all points, at last with turns of single joints against the model → poses, weights, shape
-//! and their [`uncertainty`].
+//! and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
 pub mod curve;
+pub mod own_motion;
 pub mod people;
 pub mod problem;
 pub mod start;

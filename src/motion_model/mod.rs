@@ -3,6 +3,7 @@
 pub mod cadence;
 pub mod cycle;
 pub mod database;
+pub mod departure;
 pub mod gait;
 pub mod markers;
 pub mod model;
@@ -10,7 +11,8 @@ pub mod segment;
 pub mod synthetic;
 
 pub use cadence::CadenceLaw;
+pub use departure::Departure;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
 pub use gait::{Gait, gait};
 pub use model::{Detail, Member, Model, ModelError};
-pub use segment::{Label, Segments, segment};
+pub use segment::{Label, Segments, overground, segment};
