@@ -41,7 +41,6 @@ pub struct OutputArgs {
 /// What `--over nearest` stands for.
 const NEAREST: &str = "nearest";
 
-
 /// Names of one motion's files.
 pub struct Names {
     pub bvh: String,

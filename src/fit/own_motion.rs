@@ -89,7 +89,7 @@ mod tests {
     use crate::fit::curve::{Curve, tests::made_up_model};
     use crate::fit::state::{Carrier, State, Turns};
     use crate::math::rotation::exp;
-    use crate::motion_model::{Activity, SAMPLES};
+    use crate::motion_model::{Activity, Model, SAMPLES};
 
     /// A walk along x of a z-up world whose left knee and root depart from the model.
     fn fit(cycles: f64, knee: impl Fn(f64) -> Vector3<f64>, lean: Vector3<f64>) -> Fit {
@@ -103,9 +103,8 @@ mod tests {
             phase: 0.2 + cycles * t as f64 / 100.0,
         };
         let carriers: Vec<Carrier> = (0..100).map(carrier).collect();
-        let turns = |c: &Carrier| -> Turns {
-            std::array::from_fn(|k| if DEVIATING[k] == Joint::LKnee { knee(c.phase) } else { Vector3::zeros() })
-        };
+        let turns =
+            |c: &Carrier| -> Turns { std::array::from_fn(|k| if DEVIATING[k] == Joint::LKnee { knee(c.phase) } else { Vector3::zeros() }) };
         let deviations = carriers.iter().map(turns).collect();
         let weights = vec![1.0, -0.5, 0.3];
         let state = State { carriers, weights, shape, posture: Turns::default(), deviations };
@@ -129,18 +128,16 @@ mod tests {
         let knee = |phase: f64| Vector3::new(0.08 + 0.05 * (std::f64::consts::TAU * phase).cos(), 0.0, 0.0);
         let fit = fit(1.3, knee, Vector3::new(0.1, 0.0, 0.0));
         let departure = departure(&fit).unwrap();
-        let mut style = crate::motion_model::Model { activity: Activity::Walking, ..made_up_model(3) };
-        style.members.clear();
+        let model = made_up_model(3);
         let detail = departure.detail();
         for sample in (0..SAMPLES).step_by(7) {
             let phase = sample as f64 / SAMPLES as f64;
-            let (joints, root) = style.posture_with(&fit.state.weights, Some(&detail), phase);
-            let (bare, _) = style.posture(&fit.state.weights, phase);
+            let (joints, root) = model.posture_with(&fit.state.weights, Some(&detail), phase);
+            let (bare, still) = model.posture(&fit.state.weights, phase);
             let off = (bare[Joint::LKnee as usize - 1].inverse() * joints[Joint::LKnee as usize - 1]).angle();
             assert!((off - knee(phase).x.abs()).abs() < 0.006, "{phase}: {off} {}", knee(phase).x);
             assert!(bare[Joint::RHip as usize - 1].angle_to(&joints[Joint::RHip as usize - 1]) < 1e-6);
             // The lean of the carrier is the person's: it stands before the model's own turn of the root.
-            let (_, still) = style.posture(&fit.state.weights, phase);
             let wanted = exp(&Vector3::new(0.1, 0.0, 0.0)) * exp(&still.rotation);
             assert!(exp(&root.rotation).angle_to(&wanted) < 0.02, "{phase}: {}", exp(&root.rotation).angle_to(&wanted));
         }
@@ -151,7 +148,9 @@ mod tests {
         let fit = fit(0.55, |_| Vector3::new(0.1, 0.0, 0.0), Vector3::zeros());
         let detail = departure(&fit).unwrap().detail();
         let knee = 3 * (Joint::LKnee as usize - 1);
-        let turned: Vec<f64> = (0..SAMPLES).map(|k| detail.vector.as_slice()[k * crate::body::DOF + knee..][..3].iter().map(|v| v * v).sum::<f64>().sqrt()).collect();
+        let turned: Vec<f64> = (0..SAMPLES)
+            .map(|k| detail.vector.as_slice()[k * crate::body::DOF + knee..][..3].iter().map(|v| v * v).sum::<f64>().sqrt())
+            .collect();
         assert!(turned.iter().all(|v| (0.05..0.2).contains(v)), "{turned:?}");
     }
 
@@ -160,7 +159,7 @@ mod tests {
         let mut still = fit(1.0, |_| Vector3::zeros(), Vector3::zeros());
         still.state.carriers.iter_mut().for_each(|c| c.position.x = 0.0);
         assert_eq!(departure(&still), None);
-        let jump = Fit { curve: Curve::new(&crate::motion_model::Model { activity: Activity::Jumping, ..made_up_model(3) }, 3), ..still };
+        let jump = Fit { curve: Curve::new(&Model { activity: Activity::Jumping, ..made_up_model(3) }, 3), ..still };
         assert_eq!(departure(&jump), None);
     }
 }

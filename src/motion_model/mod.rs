@@ -11,8 +11,8 @@ pub mod segment;
 pub mod synthetic;
 
 pub use cadence::CadenceLaw;
-pub use departure::Departure;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
+pub use departure::Departure;
 pub use gait::{Gait, gait};
 pub use model::{Detail, Member, Model, ModelError};
 pub use segment::{Label, Segments, overground, segment};

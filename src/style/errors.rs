@@ -64,11 +64,8 @@ impl Ruler {
             let mean = |sum: f64| sum / SAMPLES as f64;
             (mean(own().map(|v| v * v).sum()).sqrt(), mean(own().sum()))
         };
-        let apart: Vec<f64> = positions(found, &self.offsets)
-            .iter()
-            .zip(positions(wanted, &self.offsets))
-            .map(|(a, b)| (a - b).norm_squared())
-            .collect();
+        let apart: Vec<f64> =
+            positions(found, &self.offsets).iter().zip(positions(wanted, &self.offsets)).map(|(a, b)| (a - b).norm_squared()).collect();
         Errors {
             angle_rad: (off.norm_squared() / off.len() as f64).sqrt(),
             position_m: (apart.iter().sum::<f64>() / apart.len() as f64).sqrt(),

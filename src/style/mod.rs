@@ -15,8 +15,8 @@ pub mod validate;
 
 pub use curves::Population;
 pub use distance::Metric;
-pub use nearest::Nearest;
 pub use extrapolate::{Extrapolation, StyleError, extrapolate};
+pub use nearest::Nearest;
 pub use transfer::transfer;
 
 use nalgebra::DVector;
@@ -226,11 +226,11 @@ mod tests {
     fn what_tracking_saw_beside_the_weights_goes_on_at_other_speeds() {
         let people = |s: u64| [0.9, 1.2, 1.5].map(|v| synthetic::subject(Activity::Walking, s).mean_cycle(v));
         let model = Model::build(Activity::Walking, true, &(1..=6).flat_map(people).collect::<Vec<_>>()).unwrap();
-        let weights = model.project(&model.vector_of(&people(1000)[1])).rows(0, 8).into_owned();
+        let weights = model.project(&model.vector_of(&people(1000)[1])).rows(0, 5).into_owned();
         let bent = Departure { turns: [("l_knee".to_string(), vec![[0.1, 0.0, 0.0]])].into(), root_height: -0.02 };
         let plain = Style::of_weights(&model, "", &weights, 1.2, 0.9, 0.95);
         let style = plain.clone().departing(Some(bent.clone()));
-        let population = Population::new(&model, 8);
+        let population = Population::new(&model, 5);
         let knee = 3 * (Joint::LKnee as usize - 1);
         for parameter in [0.9, 1.2, 1.5] {
             let at = |s: &Style| s.at(&population, Method::Default, parameter).unwrap();

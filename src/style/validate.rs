@@ -18,11 +18,10 @@ use rayon::prelude::*;
 use super::angles::{Angles, wrapped};
 use super::curves::{JUST_BEYOND, Knot, Population, knots, mean_root, mean_vector};
 use super::distance::Metric;
-use super::errors;
+use super::errors::{self, positions};
 use super::extrapolate::extrapolate;
 use super::transfer::transfer;
 use super::{Observation, StyleError};
-use super::errors::positions;
 use crate::body::{NODES, Shape};
 use crate::motion_model::{Cycle, Detail, Member, Model, ModelError};
 

@@ -25,8 +25,8 @@ use muybridge::style::{Method, Metric, Population, Style};
 
 use super::super::interrupt;
 use super::super::model::default_variance;
-use super::super::motions::{ActivityName, exclude, file_name, read_recordings};
-use super::super::outputs::{Made, Rows};
+use super::super::motions::{ActivityName, file_name, read_recordings};
+use super::super::outputs::{Made, Rows, own_cycle, same};
 use super::super::render::{Take, write_session};
 use super::super::track::{self, NamedModel};
 use super::takes::observe;
@@ -107,7 +107,7 @@ pub fn run(args: &HeadlineArgs) -> Result<()> {
 
 impl<'a> Person<'a> {
     fn new(args: &HeadlineArgs, entries: &'a [Entry], cycles: &[Cycle], name: &'a str) -> Result<Person<'a>> {
-        exclude(entries.to_vec(), &[name.to_string()])?;
+        ensure!(entries.iter().any(|e| e.subject == name), "--subject {name} is nobody of the recordings");
         let (own, others): (Vec<Cycle>, Vec<Cycle>) = cycles.iter().cloned().partition(|c| c.subject == name);
         let wanted = args.at.unwrap_or(0.0);
         let nearest = own.iter().min_by(|a, b| (a.parameter - wanted).abs().total_cmp(&(b.parameter - wanted).abs()));
@@ -212,9 +212,9 @@ impl<'a> Person<'a> {
         };
         let others = self.recorded.iter().filter(|c| (c.parameter - self.filmed()).abs() > SAME_PARAMETER);
         let motions = others.map(made).collect::<Result<Vec<Made>>>()?;
-        let own = super::super::outputs::own_cycle(model, style);
+        let own = own_cycle(model, style);
         let rows = Rows { shape, motions: &motions, own: &own, figures: FIGURES };
-        rows.draw(&folder.join("strips"), "recorded", &|value| super::super::outputs::same(&self.recorded, value).cloned())?;
+        rows.draw(&folder.join("strips"), "recorded", &|value| same(&self.recorded, value).cloned())?;
         rows.draw_over_nearest(folder, model, style)
     }
 }

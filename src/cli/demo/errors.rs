@@ -3,8 +3,8 @@
 use anyhow::{Result, bail};
 use muybridge::body::{Joint, Length, Pose, PosedSurface, Shape, Surface, place};
 use muybridge::math::rotation::exp;
-use muybridge::motion_model::synthetic::REPEATS;
 use muybridge::motion::Synthesis;
+use muybridge::motion_model::synthetic::REPEATS;
 use muybridge::motion_model::{Cycle, Detail, Model, SAMPLES};
 use muybridge::phantom::truth::{ANGLES, JointErrors, Positions, distance_to_skin, joint_errors};
 use muybridge::style::{Metric, Population, Style};
@@ -143,7 +143,9 @@ fn speed_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &
     for motion in generated {
         let speed_m_s = motion.kmh / 3.6;
         let wanted = truth.subject.mean_cycle(speed_m_s);
-        let error = |weights: &[f64], detail: Option<&Detail>| against(truth, &model.model.cycle_with(weights, detail, speed_m_s, 1.0, 1.0), &wanted);
+        let error = |weights: &[f64], detail: Option<&Detail>| {
+            against(truth, &model.model.cycle_with(weights, detail, speed_m_s, 1.0, 1.0), &wanted)
+        };
         let error_of = |s: &Synthesis| error(s.weights.as_slice(), s.detail.as_ref());
         let cadence = |frequency_hz: f64| 100.0 * (frequency_hz * wanted.duration_s - 1.0).abs();
         let from_truth = at_speed(model, &true_style, speed_m_s)?;
