@@ -2,7 +2,7 @@
 //! a function of the phase.
 //!
 //! With r_t the tracked coordinates of frame t at phase μ_t (joints about the model's mean rotations, root against its way)
-//! less the model's at the fitted weights, the series r(μ) = Σ a_k f_k(μ) of [`Departure`] has
+//! less those of the model itself at the fitted weights, the series r(μ) = Σ a_k f_k(μ) of [`Departure`] has
 //!   a = (Σ_t f(μ_t) f(μ_t)ᵀ + n ρ D)⁻¹ Σ_t f(μ_t) r_t,   D = diag(0, 1, 1, …),                                    (1)
 //! so phases that were not seen keep to the person's mean difference.
 //! The height: in gaits the lowest ankle stands on the floor, which gives the root's height over it.
@@ -12,10 +12,11 @@
 use nalgebra::{DMatrix, Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use super::Fit;
-use super::curve::CurveSample;
+use super::curve::{Curve, CurveSample};
 use super::state::DEVIATING;
 use crate::body::{Joint, place};
 use crate::math::rotation::log;
+use crate::motion_model::Model;
 use crate::motion_model::departure::{Departure, harmonics};
 
 /// Functions of the series: constant and three harmonics; a fourth changes nothing on recorded runners and walkers.
@@ -27,25 +28,27 @@ const REACH: usize = 4;
 /// Fewer frames are none to tell a person's own motion from.
 const FEWEST: usize = 2 * FUNCTIONS;
 
-/// What the fit holds of the person's motion beside its weights; `None` for jumps and where the person does not move on.
-pub fn departure(fit: &Fit) -> Option<Departure> {
+/// What the fit holds of the person's motion beside its weights in `model`, with which it was made; `None` for jumps and where
+/// the person does not move on.
+pub fn departure(fit: &Fit, model: &Model) -> Option<Departure> {
     let frames = fit.poses.len();
     if !fit.curve.is_cyclic() || frames < FEWEST {
         return None;
     }
-    let joints: Vec<Joint> = std::iter::once(Joint::Root).chain(DEVIATING).collect();
+    let curve = Curve::new(model, fit.state.weights.len());
+    let joints = Joint::ALL;
     let mut residuals = DMatrix::zeros(frames, 3 * joints.len());
     let mut functions = DMatrix::zeros(frames, FUNCTIONS);
     let mut heights = 0.0;
     let floor = floor_m(fit);
     let hip_height_m = fit.shape().hip_height_m();
     for (t, (pose, carrier)) in fit.poses.iter().zip(&fit.state.carriers).enumerate() {
-        let sample = fit.curve.sample(carrier.phase, &fit.state.weights);
+        let sample = curve.sample(carrier.phase, &fit.state.weights);
         let value = sample.value.as_slice();
         for (k, joint) in joints.iter().enumerate() {
             let r = match *joint as usize {
                 0 => log(&(upright(fit, t)?.inverse() * pose.world_from_root)) - CurveSample::root_rotation(value),
-                j => log(&(fit.curve.mean_rotations[j - 1].inverse() * pose.joints[j - 1])) - CurveSample::joint(value, j - 1),
+                j => log(&(curve.mean_rotations[j - 1].inverse() * pose.joints[j - 1])) - CurveSample::joint(value, j - 1),
             };
             (0..3).for_each(|axis| residuals[(t, 3 * k + axis)] = r[axis]);
         }
@@ -55,7 +58,9 @@ pub fn departure(fit: &Fit) -> Option<Departure> {
     let mut normal = functions.tr_mul(&functions);
     (1..FUNCTIONS).for_each(|k| normal[(k, k)] += RIDGE * frames as f64);
     let series = normal.cholesky()?.solve(&functions.tr_mul(&residuals));
-    let of_joint = |k: usize| (0..FUNCTIONS).map(|f| [0, 1, 2].map(|axis| series[(f, 3 * k + axis)])).collect();
+    // The other joints follow the model but for a constant.
+    let functions = |joint: Joint| if joint == Joint::Root || DEVIATING.contains(&joint) { FUNCTIONS } else { 1 };
+    let of_joint = |k: usize| (0..functions(joints[k])).map(|f| [0, 1, 2].map(|axis| series[(f, 3 * k + axis)])).collect();
     let turns = joints.iter().enumerate().map(|(k, joint)| (joint.name().to_string(), of_joint(k)));
     Some(Departure { turns: turns.collect(), root_height: heights / frames as f64 })
 }
@@ -89,7 +94,7 @@ mod tests {
     use crate::fit::curve::{Curve, tests::made_up_model};
     use crate::fit::state::{Carrier, State, Turns};
     use crate::math::rotation::exp;
-    use crate::motion_model::{Activity, Model, SAMPLES};
+    use crate::motion_model::{Activity, SAMPLES};
 
     /// A walk along x of a z-up world whose left knee and root depart from the model.
     fn fit(cycles: f64, knee: impl Fn(f64) -> Vector3<f64>, lean: Vector3<f64>) -> Fit {
@@ -126,9 +131,8 @@ mod tests {
     #[test]
     fn a_known_departure_comes_back_over_the_whole_cycle() {
         let knee = |phase: f64| Vector3::new(0.08 + 0.05 * (std::f64::consts::TAU * phase).cos(), 0.0, 0.0);
-        let fit = fit(1.3, knee, Vector3::new(0.1, 0.0, 0.0));
-        let departure = departure(&fit).unwrap();
-        let model = made_up_model(3);
+        let (fit, model) = (fit(1.3, knee, Vector3::new(0.1, 0.0, 0.0)), made_up_model(3));
+        let departure = departure(&fit, &model).unwrap();
         let detail = departure.detail();
         for sample in (0..SAMPLES).step_by(7) {
             let phase = sample as f64 / SAMPLES as f64;
@@ -141,12 +145,17 @@ mod tests {
             let wanted = exp(&Vector3::new(0.1, 0.0, 0.0)) * exp(&still.rotation);
             assert!(exp(&root.rotation).angle_to(&wanted) < 0.02, "{phase}: {}", exp(&root.rotation).angle_to(&wanted));
         }
+        // Weights and departure together are the tracked postures.
+        for (pose, carrier) in fit.poses.iter().zip(&fit.state.carriers).step_by(9) {
+            let (joints, _) = model.posture_with(&fit.state.weights, Some(&detail), carrier.phase);
+            assert!(joints.iter().zip(&pose.joints).all(|(a, b)| a.angle_to(b) < 0.01));
+        }
     }
 
     #[test]
     fn phases_that_were_not_seen_keep_to_the_mean_difference() {
         let fit = fit(0.55, |_| Vector3::new(0.1, 0.0, 0.0), Vector3::zeros());
-        let detail = departure(&fit).unwrap().detail();
+        let detail = departure(&fit, &made_up_model(3)).unwrap().detail();
         let knee = 3 * (Joint::LKnee as usize - 1);
         let turned: Vec<f64> = (0..SAMPLES)
             .map(|k| detail.vector.as_slice()[k * crate::body::DOF + knee..][..3].iter().map(|v| v * v).sum::<f64>().sqrt())
@@ -158,8 +167,8 @@ mod tests {
     fn who_stands_or_jumps_has_no_own_motion() {
         let mut still = fit(1.0, |_| Vector3::zeros(), Vector3::zeros());
         still.state.carriers.iter_mut().for_each(|c| c.position.x = 0.0);
-        assert_eq!(departure(&still), None);
+        assert_eq!(departure(&still, &made_up_model(3)), None);
         let jump = Fit { curve: Curve::new(&Model { activity: Activity::Jumping, ..made_up_model(3) }, 3), ..still };
-        assert_eq!(departure(&jump), None);
+        assert_eq!(departure(&jump, &made_up_model(3)), None);
     }
 }
