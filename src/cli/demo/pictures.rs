@@ -9,7 +9,7 @@ use muybridge::motion_model::{Cycle, SAMPLES};
 use muybridge::phantom::DepthMap;
 use muybridge::report::{self, Curve};
 
-use super::{Generated, SPEED_M_S, Truth};
+use super::{Generated, Truth};
 use crate::cli::outputs::own_cycle;
 use crate::cli::track::{self, NamedModel, Tracked};
 
