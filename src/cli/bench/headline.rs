@@ -244,8 +244,8 @@ fn table(scores: &[Score]) -> String {
     speeds.sort_by(f64::total_cmp);
     speeds.dedup();
     for at in speeds {
-        let rows: [(&str, fn(&Errors) -> f64); 2] = [("deg", |e| e.angle_rad.to_degrees()), ("mm", |e| 1e3 * e.position_m)];
-        for (unit, of) in rows {
+        for unit in ["deg", "mm"] {
+            let of = |e: &Errors| if unit == "deg" { e.angle_rad.to_degrees() } else { 1e3 * e.position_m };
             text += &format!("{at:>5.2} {unit:<4}");
             for from in ["tracked", "recorded"] {
                 for method in METHODS {
