@@ -131,11 +131,18 @@ fn a_folder_of_outputs_counts_every_motion_once() {
         "--strips",
         "--over",
         &walk,
+        "--over",
+        "nearest",
         "-o",
         &again.to_string_lossy(),
     ]);
     assert!(done, "{error}");
     let svg = std::fs::read_to_string(again.join("strips.svg")).unwrap();
-    // One row of nine pale figures of 26 bones, and the legend's line; three rows of strong ones.
-    assert_eq!(svg.matches("stroke-width=\"6\"").count(), 9 * 27 + 1);
+    // The recording below the person's own row and the generated one of its speed: nine pale figures each, and the legend's line.
+    assert_eq!(svg.matches("stroke-width=\"6\"").count(), 2 * 9 * 27 + 1);
+    assert!(svg.contains(">recorded</text>"));
+    // The nearest person of the database walks at every speed.
+    let svg = std::fs::read_to_string(again.join("strips_nearest.svg")).unwrap();
+    assert_eq!(svg.matches("stroke-width=\"6\"").count(), 3 * 9 * 27 + 1);
+    assert!(svg.contains(", nearest of the database by equation 6</text>"));
 }

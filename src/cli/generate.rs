@@ -12,7 +12,7 @@ use muybridge::io::style_json::read_style;
 use muybridge::io::{is_motion_file, write_atomic};
 use muybridge::motion::player::ACCELERATION_M_S2;
 use muybridge::motion::{Gait, Gaits, Length, Profile, Step, Synthesis, follow, plant_feet, play, synthesize};
-use muybridge::motion_model::{Activity, Cycle, Model};
+use muybridge::motion_model::{Activity, Model};
 use muybridge::report::generated::{self, GeneratedReport};
 use muybridge::style::{Method, Metric, Population, Style};
 
@@ -275,19 +275,13 @@ fn planted(args: &GenerateArgs, name: &str, clip: Clip) -> Clip {
 
 fn write_files(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, motions: &[Made]) -> Result<()> {
     let source = Source { motion: file_name(&args.style), model: file_name(&args.model), model_hash: model_hash(model) };
-    args.files.write(&args.output, shape, source, motions, &own_cycle(model, style))
+    args.files.write(&args.output, shape, source, motions, model, style)
 }
 
 fn population(args: &GenerateArgs, model: &Model, style: &Style) -> Result<Population> {
     let part = args.variance.or((method(args)? != Method::Default).then(|| default_variance(model.activity)));
     let wanted = part.map_or(style.weights.len(), |v| model.components(v));
     Ok(Population::new(model, wanted.min(style.weights.len())))
-}
-
-/// The person's motion as observed.
-fn own_cycle(model: &Model, style: &Style) -> Cycle {
-    let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(style.parameter, style.hip_height_m);
-    model.cycle(&style.weights, "", style.parameter, style.hip_height_m, 1.0 / frequency_hz)
 }
 
 fn table_row(name: &str, model: &Model, s: &Synthesis) -> String {

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use muybridge::body::{Clip, Shape};
 use muybridge::io::exchange::{c3d, mot, trc};
@@ -11,8 +11,9 @@ use muybridge::io::outputs_json::{FileNote, Kind, Outputs, Source};
 use muybridge::io::{bvh, glb, people_glb};
 use muybridge::math::euler::Order;
 use muybridge::motion::{Length, play_cycle};
-use muybridge::motion_model::{Activity, Cycle};
+use muybridge::motion_model::{Activity, Cycle, Model};
 use muybridge::report::{self, strips};
+use muybridge::style::{Nearest, Style};
 use nalgebra::Rotation3;
 
 use super::motions::read_recordings;
@@ -31,10 +32,14 @@ pub struct OutputArgs {
     /// Also draw strips.png and strips.svg: the person's own motion and every generated one, this many figures each
     #[arg(long, value_name = "FIGURES", num_args = 0..=1, default_missing_value = FIGURES, value_parser = clap::value_parser!(u16).range(2..=60))]
     strips: Option<u16>,
-    /// Recorded motion to draw pale below the generated one of its speed or length; may be repeated
+    /// Recorded motion to draw pale below the generated one of its speed or length; may be repeated. The word `nearest` also
+    /// draws strips_nearest.png and .svg over the person of the database who is nearest by the paper's equation 6
     #[arg(long, value_name = "MOTION", requires = "strips")]
     over: Vec<PathBuf>,
 }
+
+/// What `--over nearest` stands for.
+const NEAREST: &str = "nearest";
 
 /// Names of one motion's files.
 pub struct Names {
@@ -126,36 +131,66 @@ pub struct Made {
 
 impl OutputArgs {
     /// Everything that `generate` writes of its motions: each in all formats, all in one GLB named after the activity, the strips.
-    /// `own` is the person's motion as observed.
-    pub fn write(&self, folder: &Path, shape: &Shape, source: Source, motions: &[Made], own: &Cycle) -> Result<()> {
+    pub fn write(&self, folder: &Path, shape: &Shape, source: Source, motions: &[Made], model: &Model, style: &Style) -> Result<()> {
         let mut writer = Writer::new(folder, shape, None, self.bvh_order, source);
         for made in motions {
             writer.motion(&Names::of(&made.stem), &made.stem, &made.clip)?;
         }
-        writer.together(&format!("{}.glb", own.activity), motions)?;
+        writer.together(&format!("{}.glb", model.activity), motions)?;
         writer.finish()?;
-        match self.strips {
-            Some(figures) => self.draw_strips(folder, shape, motions, own, figures.into()),
-            None => Ok(()),
-        }
+        let Some(figures) = self.strips else { return Ok(()) };
+        let (words, files): (Vec<PathBuf>, Vec<PathBuf>) = self.over.iter().cloned().partition(|f| f.as_os_str() == NEAREST);
+        let recorded = recorded(&files, model.activity)?;
+        let rows = Rows { shape, motions, own: &own_cycle(model, style), figures: figures.into() };
+        rows.draw(&folder.join("strips"), "recorded", &|value| same(&recorded, value).cloned())?;
+        if !words.is_empty() { rows.draw_over_nearest(folder, model, style) } else { Ok(()) }
+    }
+}
+
+/// The person's motion as observed.
+pub fn own_cycle(model: &Model, style: &Style) -> Cycle {
+    let frequency_hz = style.cadence_factor * model.cadence().frequency_hz(style.parameter, style.hip_height_m);
+    model.cycle_with(&style.weights, style.detail.as_ref(), style.parameter, style.hip_height_m, 1.0 / frequency_hz)
+}
+
+/// Strips to draw: the person's own motion, and every generated one.
+pub struct Rows<'a> {
+    pub shape: &'a Shape,
+    pub motions: &'a [Made],
+    pub own: &'a Cycle,
+    pub figures: usize,
+}
+
+impl Rows<'_> {
+    /// Writes strips_nearest.png and .svg over the database's nearest person.
+    pub fn draw_over_nearest(&self, folder: &Path, model: &Model, style: &Style) -> Result<()> {
+        let nearest = Nearest::new(model, style).context("the model holds nobody")?;
+        let legend = format!("{}, nearest of the database by equation 6", nearest.subject);
+        self.draw(&folder.join("strips_nearest"), &legend, &|value| Some(nearest.cycle(model, value, style.hip_height_m)))
     }
 
-    fn draw_strips(&self, folder: &Path, shape: &Shape, motions: &[Made], own: &Cycle, figures: usize) -> Result<()> {
-        let activity = own.activity;
-        let unit = if activity.is_cyclic() { "m/s" } else { "m" };
-        let recorded = recorded(&self.over, activity)?;
-        let of_body = |cycle: &Cycle| Played::new(cycle, shape);
-        let below: Vec<Option<Played>> = motions.iter().map(|made| nearest(&recorded, made.value).map(of_body)).collect();
-        let own_motion = of_body(own);
-        let row = |label: String, made, recorded| strips::Strip { label, made, recorded, cyclic: activity.is_cyclic() };
-        let mut rows = vec![row(format!("own, {:.2} {unit}", own.parameter), own_motion.phases(), None)];
-        for (made, below) in motions.iter().zip(&below) {
-            let phases = strips::Phases { clip: &made.clip, cycle_s: 1.0 / made.frequency_hz };
-            rows.push(row(format!("{:.2} {unit}", made.value), phases, below.as_ref().map(Played::phases)));
-        }
-        let drawing = strips::strips(&rows, figures, strips::FROM_THE_SIDE)?;
-        report::save(&folder.join("strips.png"), &drawing.picture()?)?;
-        Ok(report::save_drawing(&folder.join("strips.svg"), &drawing)?)
+    /// Writes `stem`.png and `stem`.svg, with what `below` has at a speed or length drawn pale below.
+    pub fn draw(&self, stem: &Path, legend: &str, below: &dyn Fn(f64) -> Option<Cycle>) -> Result<()> {
+        let cyclic = self.own.activity.is_cyclic();
+        let unit = if cyclic { "m/s" } else { "m" };
+        let of_body = |cycle: &Cycle| Played::new(cycle, self.shape);
+        let values: Vec<f64> = std::iter::once(self.own.parameter).chain(self.motions.iter().map(|m| m.value)).collect();
+        let under: Vec<Option<Played>> = values.iter().map(|v| below(*v).as_ref().map(of_body)).collect();
+        let own = of_body(self.own);
+        let made = self.motions.iter().map(|m| strips::Phases { clip: &m.clip, cycle_s: 1.0 / m.frequency_hz });
+        let rows: Vec<strips::Strip> = std::iter::once(own.phases())
+            .chain(made)
+            .enumerate()
+            .map(|(k, made)| strips::Strip {
+                label: format!("{}{:.2} {unit}", if k == 0 { "own, " } else { "" }, values[k]),
+                made,
+                below: under[k].as_ref().map(Played::phases),
+                cyclic,
+            })
+            .collect();
+        let drawing = strips::strips(&rows, self.figures, strips::FROM_THE_SIDE, legend)?;
+        report::save(&stem.with_extension("png"), &drawing.picture()?)?;
+        Ok(report::save_drawing(&stem.with_extension("svg"), &drawing)?)
     }
 }
 
@@ -190,7 +225,7 @@ fn recorded(files: &[PathBuf], activity: Activity) -> Result<Vec<Cycle>> {
 }
 
 /// The recorded cycle of about this speed or length.
-fn nearest(recorded: &[Cycle], value: f64) -> Option<&Cycle> {
+pub fn same(recorded: &[Cycle], value: f64) -> Option<&Cycle> {
     let off = |c: &Cycle| (c.parameter / value - 1.0).abs();
     recorded.iter().filter(|c| off(c) < SAME).min_by(|a, b| off(a).total_cmp(&off(b)))
 }

@@ -7,7 +7,7 @@ use clap::Args;
 use image::GrayImage;
 use muybridge::body::{Clip, NODES, Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
-use muybridge::fit::{self, Checkpoints, Fit, FitOptions, Observation};
+use muybridge::fit::{self, Checkpoints, Fit, FitOptions, Observation, own_motion};
 use muybridge::footage::FrameSet;
 use muybridge::io::outputs_json::Source;
 use muybridge::io::session_config::{self, DEFAULT_ACTIVITY, SessionConfig};
@@ -235,7 +235,7 @@ pub fn style(fit: &Fit, model: &NamedModel) -> Style {
     let covariance =
         rows.clone().map(|i| rows.clone().map(|j| fit.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, j)])).collect()).collect();
     let style = Style::of_weights(&model.model, &model.hash, &weights, fit.parameter(model.model.activity), hip_height, fit.cadence_hz);
-    Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }
+    Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }.departing(own_motion::departure(fit, &model.model))
 }
 
 /// The fitted poses in a y-up world, one per 1/fps second, dropped frames filled in; and the rotation into that world.

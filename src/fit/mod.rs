@@ -3,12 +3,14 @@
 //! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]) → root, phases, weights, shape by
 //! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart,
 //! then with more components and all points, at last with turns of single joints against the model → poses, weights, shape
+//! and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
 //! and their [`uncertainty`]. In that last stage the components only say how the person moves, no longer how he or she is
 //! held: what a component adds all cycle long is mostly where another laboratory put its markers, and weights that had to
 //! explain this person's posture with it were far from those of the same person's recordings.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
 pub mod curve;
+pub mod own_motion;
 pub mod people;
 pub mod problem;
 pub mod start;

@@ -3,6 +3,7 @@
 pub mod cadence;
 pub mod cycle;
 pub mod database;
+pub mod departure;
 pub mod gait;
 pub mod markers;
 pub mod model;
@@ -11,6 +12,7 @@ pub mod synthetic;
 
 pub use cadence::CadenceLaw;
 pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
+pub use departure::Departure;
 pub use gait::{Gait, gait};
 pub use model::{Detail, Member, Model, ModelError};
-pub use segment::{Label, Segments, segment};
+pub use segment::{Label, Segments, overground, segment};

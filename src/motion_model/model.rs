@@ -214,6 +214,17 @@ impl Model {
         })
     }
 
+    /// [`Model::cycle`] with what the weights do not hold, of nobody in particular.
+    pub fn cycle_with(&self, weights: &[f64], detail: Option<&Detail>, parameter: f64, hip_height_m: f64, duration_s: f64) -> Cycle {
+        let (mut vector, mut root) = (self.vector(weights), self.root(weights));
+        if let Some(detail) = detail {
+            vector += &detail.vector;
+            root += &detail.root;
+        }
+        let (subject, source) = (String::new(), "synthesized".to_string());
+        self.cycle_of(&Member { subject, source, parameter, hip_height_m, duration_s, vector, root })
+    }
+
     /// A cycle as a member: its vector is relative to this model's mean rotations.
     pub fn member_of(&self, cycle: &Cycle) -> Member {
         member(&self.mean_rotations, cycle)

@@ -36,6 +36,8 @@ const HEEL: (f64, f64) = (-0.06, -0.07);
 const PEAK_DROP: f64 = 0.1;
 /// Gaussian average over positions before events are read from them.
 const SMOOTH_S: f64 = 0.015;
+/// Somebody whose root goes at less than this part of the known speed is on a treadmill.
+const ON_A_BELT: f64 = 0.4;
 /// A clip whose root is slower than this is a treadmill's, or a stand, m/s.
 const TRAVELS_M_S: f64 = 0.2;
 /// Largest r.m.s. difference of the leg joints between the two ends of a cycle. Recorded steady cycles stay below 6 degrees,
@@ -110,6 +112,15 @@ pub fn segment(clip: &Clip, label: &Label) -> Result<Segments, SegmentError> {
         return Err(SegmentError::Short { frames: track.poses.len(), seconds, activity });
     }
     if label.activity.is_cyclic() { gait(track, label) } else { jumps(&track, label) }
+}
+
+/// The clip over the ground: with the way that a treadmill's belt took from under the person, whose speed is given.
+pub fn overground(clip: &Clip, speed_m_s: f64) -> Clip {
+    let mut track = Track::new(clip, 0..clip.poses.len());
+    if travel_speed(&track) < ON_A_BELT * speed_m_s {
+        track.add_belt(speed_m_s);
+    }
+    Clip { poses: track.poses, ..clip.clone() }
 }
 
 /// A clip's poses with the positions that events are read from.
@@ -215,7 +226,7 @@ fn wrapped(angle: f64) -> f64 {
 fn gait(mut track: Track, label: &Label) -> Result<Segments, SegmentError> {
     let speed_m_s = travel_speed(&track);
     match label.parameter {
-        Some(belt) if speed_m_s < 0.4 * belt => track.add_belt(belt),
+        Some(belt) if speed_m_s < ON_A_BELT * belt => track.add_belt(belt),
         None if speed_m_s < TRAVELS_M_S => return Err(SegmentError::Standing { speed_m_s }),
         _ => {}
     }

@@ -1,6 +1,6 @@
 //! Strips of superposed stick figures, as in the style paper's Figures 3, 5, 6, 7, 9, 12 and 13: one row per speed or length,
-//! figures at even phases side by side, from the subject's right or its front right, walking to the right, what was recorded
-//! pale below what was made. Figures 2 to 4 of the vector-space paper are such strips too.
+//! figures at even phases side by side, from the subject's right or its front right, walking to the right, another motion (what
+//! was recorded, or the nearest person of the database) pale below what was made. Figures 2 to 4 of the vector-space paper are such strips too.
 //!
 //! Every figure stands on the row's floor with its root at the middle of its place, so that rows compare posture against
 //! posture at the same phase, whatever the speed.
@@ -35,8 +35,8 @@ pub struct Phases<'a> {
 pub struct Strip<'a> {
     pub label: String,
     pub made: Phases<'a>,
-    /// Drawn pale below.
-    pub recorded: Option<Phases<'a>>,
+    /// Another motion, drawn pale below.
+    pub below: Option<Phases<'a>>,
     /// Gaits come round to phase 0, jumps end at phase 1.
     pub cyclic: bool,
 }
@@ -44,14 +44,14 @@ pub struct Strip<'a> {
 /// Node positions as (right of the root as seen, height) in metres.
 type Figure = [[f64; 2]; NODES];
 
-/// The rows with `figures` instants each, seen at the angle `view`; y-up worlds.
-pub fn strips(rows: &[Strip], figures: usize, view: f64) -> Result<Drawing, ReportError> {
+/// The rows with `figures` instants each, seen at the angle `view`; y-up worlds. `below` says what is drawn pale.
+pub fn strips(rows: &[Strip], figures: usize, view: f64, below: &str) -> Result<Drawing, ReportError> {
     let figures = figures.max(2);
     let all: Vec<(Vec<Figure>, Vec<Figure>)> = rows
         .iter()
         .map(|row| {
             let made = instants(&row.made, figures, row.cyclic, view);
-            (made, row.recorded.map_or(Vec::new(), |recorded| instants(&recorded, figures, row.cyclic, view)))
+            (made, row.below.map_or(Vec::new(), |below| instants(&below, figures, row.cyclic, view)))
         })
         .collect();
     let points = || all.iter().flat_map(|(made, recorded)| made.iter().chain(recorded)).flatten();
@@ -65,7 +65,7 @@ pub fn strips(rows: &[Strip], figures: usize, view: f64) -> Result<Drawing, Repo
     let place_px = 1.75 * reach * PX_PER_M;
     let row_px = tall * PX_PER_M + 26.0;
     let size = [label_px + figures as f64 * place_px + 20.0, HEAD_PX + rows.len() as f64 * row_px + 34.0];
-    let mut marks = legend(rows.iter().any(|r| r.recorded.is_some()), label_px);
+    let mut marks = legend(rows.iter().any(|r| r.below.is_some()).then_some(below), label_px);
     for (i, (row, (made, recorded))) in rows.iter().zip(&all).enumerate() {
         let floor_px = HEAD_PX + (i + 1) as f64 * row_px - 12.0;
         marks.push(Mark::Line { from: [label_px, floor_px], to: [size[0] - 16.0, floor_px], colour: GRID, width_px: 2 });
@@ -121,10 +121,10 @@ fn instants(motion: &Phases, figures: usize, cyclic: bool, view: f64) -> Vec<Fig
     (0..figures).filter_map(at).collect()
 }
 
-fn legend(recorded: bool, label_px: f64) -> Vec<Mark> {
+fn legend(below: Option<&str>, label_px: f64) -> Vec<Mark> {
     let mut entries = vec![("left", LEFT, 3), ("right", RIGHT, 3)];
-    if recorded {
-        entries.push(("recorded", super::canvas::faded(UNDER, 0.35), 6));
+    if let Some(name) = below {
+        entries.push((name, super::canvas::faded(UNDER, 0.35), 6));
     }
     let entry = |(k, (name, colour, width_px)): (usize, (&str, Colour, i32))| {
         let x = label_px + 120.0 * k as f64;
@@ -153,10 +153,10 @@ mod tests {
         let [(slow, slow_s), (fast, fast_s)] = [1.0, 1.7].map(walk);
         let [made, recorded] = [Phases { clip: &fast, cycle_s: fast_s }, Phases { clip: &slow, cycle_s: slow_s }];
         let rows = [
-            Strip { label: "1.70 m/s".into(), made, recorded: Some(made), cyclic: true },
-            Strip { label: "1.00 m/s".into(), made: recorded, recorded: None, cyclic: true },
+            Strip { label: "1.70 m/s".into(), made, below: Some(made), cyclic: true },
+            Strip { label: "1.00 m/s".into(), made: recorded, below: None, cyclic: true },
         ];
-        let drawing = strips(&rows, 8, FROM_THE_SIDE).unwrap();
+        let drawing = strips(&rows, 8, FROM_THE_SIDE, "recorded").unwrap();
         // The recording is the motion itself: every bone lies on a pale one, eight figures of 26 bones in each of the three.
         let lines = |width: i32| -> Vec<([f64; 2], [f64; 2])> {
             let bone = |mark: &Mark| match mark {
@@ -174,6 +174,7 @@ mod tests {
         let picture = drawing.picture().unwrap();
         assert_eq!([picture.width(), picture.height()], drawing.size_px);
         assert!(drawing.svg().contains(">1.70 m/s</text>") && drawing.svg().contains(">88 %</text>"));
-        assert!(strips(&[], 5, FROM_THE_SIDE).unwrap().picture().is_ok());
+        assert!(drawing.svg().contains(">recorded</text>"));
+        assert!(strips(&[], 5, FROM_THE_SIDE, "").unwrap().picture().is_ok());
     }
 }

@@ -6,7 +6,9 @@
 pub mod angles;
 pub mod curves;
 pub mod distance;
+pub mod errors;
 pub mod extrapolate;
+pub mod nearest;
 pub mod space;
 pub mod transfer;
 pub mod validate;
@@ -14,13 +16,14 @@ pub mod validate;
 pub use curves::Population;
 pub use distance::Metric;
 pub use extrapolate::{Extrapolation, StyleError, extrapolate};
+pub use nearest::Nearest;
 pub use transfer::transfer;
 
 use nalgebra::DVector;
 use serde::{Deserialize, Serialize};
 
 use crate::body::Shape;
-use crate::motion_model::{Activity, Cycle, Detail, Member, Model};
+use crate::motion_model::{Activity, Cycle, Departure, Detail, Member, Model};
 use curves::{Knot, knots, mean_root, mean_vector};
 
 /// How the weights at another parameter are found.
@@ -68,7 +71,10 @@ pub struct Style {
     pub neighbours: Vec<Neighbour>,
     /// Body size where the observation gave one.
     pub shape: Option<Shape>,
-    /// What of a recorded motion the weights do not hold; files do not keep it.
+    /// What of a tracked motion the weights do not hold.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub departure: Option<Departure>,
+    /// The same sample by sample, or of a recorded motion; files do not keep it.
     #[serde(skip)]
     pub detail: Option<Detail>,
     /// The same person at other parameters.
@@ -132,6 +138,11 @@ impl Style {
         }
     }
 
+    /// With what of a tracked motion the weights do not hold.
+    pub fn departing(self, departure: Option<Departure>) -> Style {
+        Style { detail: departure.as_ref().map(Departure::detail), departure, ..self }
+    }
+
     /// With what was seen of the same person at other times; the first observation stays the main one.
     pub fn and(mut self, other: Style) -> Style {
         self.also.extend(other.observations());
@@ -182,6 +193,7 @@ impl Style {
             cadence_factor: frequency_hz / model.cadence().frequency_hz(parameter, hip_height_m),
             neighbours,
             shape: None,
+            departure: None,
             detail: None,
             also: Vec::new(),
         }
@@ -201,5 +213,41 @@ impl Style {
         let frequency_hz = first.cadence_factor * model.cadence().frequency_hz(first.parameter, hip_height_m);
         let style = Style::of_weights(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
         Some(Style { detail: first.detail, also, ..style })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::{DOF, Joint};
+    use crate::motion_model::synthetic;
+
+    #[test]
+    fn what_tracking_saw_beside_the_weights_goes_on_at_other_speeds() {
+        let people = |s: u64| [0.9, 1.2, 1.5].map(|v| synthetic::subject(Activity::Walking, s).mean_cycle(v));
+        let model = Model::build(Activity::Walking, true, &(1..=6).flat_map(people).collect::<Vec<_>>()).unwrap();
+        let weights = model.project(&model.vector_of(&people(1000)[1])).rows(0, 5).into_owned();
+        let bent = Departure { turns: [("l_knee".to_string(), vec![[0.1, 0.0, 0.0]])].into(), root_height: -0.02 };
+        let plain = Style::of_weights(&model, "", &weights, 1.2, 0.9, 0.95);
+        let style = plain.clone().departing(Some(bent.clone()));
+        let population = Population::new(&model, 5);
+        let knee = 3 * (Joint::LKnee as usize - 1);
+        for parameter in [0.9, 1.2, 1.5] {
+            let at = |s: &Style| s.at(&population, Method::Default, parameter).unwrap();
+            let (with, without) = (at(&style), at(&plain));
+            assert!(without.detail.is_none() && with.weights == without.weights);
+            let kept = with.detail.clone().unwrap().vector[knee] / 0.1;
+            assert!(if parameter == 1.2 { (kept - 1.0).abs() < 1e-4 } else { (0.5..1.3).contains(&kept) }, "{parameter}: {kept}");
+            let cycle = |found: &Extrapolation| model.cycle_with(found.weights.as_slice(), found.detail.as_ref(), parameter, 0.9, 1.0);
+            let change = model.vector_of(&cycle(&with)) - model.vector_of(&cycle(&without));
+            for (i, v) in change.iter().enumerate() {
+                let wanted = if i % DOF == knee { 0.1 * kept } else { 0.0 };
+                assert!((v - wanted).abs() < 1e-9, "{i}: {v}");
+            }
+            let lower = cycle(&with).root[50].position.y - cycle(&without).root[50].position.y;
+            assert!((lower + 0.02 * kept).abs() < 1e-9);
+        }
+        let paper = style.at(&population, Method::Paper(Metric::Paper), 1.5).unwrap();
+        assert!(paper.detail.is_none());
     }
 }

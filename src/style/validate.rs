@@ -9,41 +9,21 @@
 //!
 //! Metrics: distances of weights, `eq6` and `mahalanobis`, over the components that hold `variance`; `rms_deg`, the root mean
 //! square over cases, samples and the angles that the recordings hold ([`Angles`]); `rms_mm`, the root mean square distance of
-//! [`JOINTS`] on the template body with the subject's hip height, pelvis on pelvis. The last two are against the mean of the
+//! [`errors::JOINTS`] on the template body with the subject's hip height, pelvis on pelvis. The last two are against the mean of the
 //! recorded cycles, not its projection; methods that keep the own motion keep what the weights do not hold of it.
 
-use nalgebra::{DVector, UnitQuaternion, Vector3};
+use nalgebra::{DVector, Vector3};
 use rayon::prelude::*;
 
 use super::angles::{Angles, wrapped};
 use super::curves::{JUST_BEYOND, Knot, Population, knots, mean_root, mean_vector};
 use super::distance::Metric;
+use super::errors::{self, positions};
 use super::extrapolate::extrapolate;
 use super::transfer::transfer;
 use super::{Observation, StyleError};
-use crate::body::{BALL_JOINTS, Joint, NODES, Pose, Shape, place};
+use crate::body::{NODES, Shape};
 use crate::motion_model::{Cycle, Detail, Member, Model, ModelError};
-
-/// Whose positions `rms_mm` compares.
-pub const JOINTS: [Joint; 14] = [
-    Joint::LHip,
-    Joint::LKnee,
-    Joint::LAnkle,
-    Joint::LMidtarsal,
-    Joint::RHip,
-    Joint::RKnee,
-    Joint::RAnkle,
-    Joint::RMidtarsal,
-    Joint::LShoulder,
-    Joint::LElbow,
-    Joint::LWrist,
-    Joint::RShoulder,
-    Joint::RElbow,
-    Joint::RWrist,
-];
-
-/// Hip height of the template as a part of stature.
-const HIP_OF_STATURE: f64 = 0.53;
 
 /// In the order of [`METHODS`].
 #[derive(Clone, Copy)]
@@ -187,7 +167,7 @@ fn leave_out(model: &Model, angles: &Angles, subject: &str, variance: f64) -> Re
         |own: bool| -> Vec<Cycle> { model.members.iter().filter(|m| (m.subject == subject) == own).map(|m| model.cycle_of(m)).collect() };
     let others = Model::build(model.activity, model.synthetic, &cycles(false))?;
     let own: Vec<Member> = cycles(true).iter().map(|c| others.member_of(c)).collect();
-    let stature = own.first().map_or(1.0, |m| m.hip_height_m) / HIP_OF_STATURE;
+    let stature = own.first().map_or(1.0, |m| m.hip_height_m) / errors::HIP_OF_STATURE;
     let bench = Bench {
         population: Population::new(&others, others.basis.ncols()),
         truncated: Population::new(&others, others.components(variance)),
@@ -281,28 +261,12 @@ impl Bench<'_> {
 
     fn shown_member(&self, member: &Member) -> Shown {
         let cycle = self.others.cycle_of(member);
-        Shown { weights: self.others.member_weights(member), angles: self.angles.of(&cycle), positions: self.positions(&cycle) }
+        Shown { weights: self.others.member_weights(member), angles: self.angles.of(&cycle), positions: positions(&cycle, &self.offsets) }
     }
 
     fn shown(&self, weights: &DVector<f64>, detail: Option<&Detail>) -> Shown {
-        let (mut vector, mut root) = (self.others.vector(weights.as_slice()), self.others.root(weights.as_slice()));
-        if let Some(detail) = detail {
-            vector += &detail.vector;
-            root += &detail.root;
-        }
-        let (subject, source) = (String::new(), String::new());
-        let cycle = self.others.cycle_of(&Member { subject, source, parameter: 0.0, hip_height_m: 1.0, duration_s: 1.0, vector, root });
-        Shown { weights: weights.clone(), angles: self.angles.of(&cycle), positions: self.positions(&cycle) }
-    }
-
-    /// Positions of [`JOINTS`] in the pelvis, metres, sample by sample.
-    fn positions(&self, cycle: &Cycle) -> Vec<Vector3<f64>> {
-        let placed = |joints: &[UnitQuaternion<f64>; BALL_JOINTS]| {
-            let pose = Pose { root: Vector3::zeros(), world_from_root: UnitQuaternion::identity(), joints: *joints };
-            let placement = place(&self.offsets, &pose);
-            JOINTS.map(|j| placement.position(j))
-        };
-        cycle.joints.iter().flat_map(placed).collect()
+        let cycle = self.others.cycle_with(weights.as_slice(), detail, 0.0, 1.0, 1.0);
+        Shown { weights: weights.clone(), angles: self.angles.of(&cycle), positions: positions(&cycle, &self.offsets) }
     }
 
     /// Mean over the subjects that take part at `parameter`, over all (extended) where nobody does.

@@ -3,6 +3,7 @@
 mod animal;
 mod coverage;
 mod fit;
+mod headline;
 mod people;
 mod stereo;
 mod sweeps;
@@ -22,6 +23,8 @@ pub enum BenchCommand {
     Fit(fit::FitArgs),
     /// The fit on phantoms over noise, rigs, frame rates, lost frames, clutter and headings, and on random walks
     Sweeps(sweeps::SweepsArgs),
+    /// Recorded people filmed by the phantom, tracked, and generated at their other speeds
+    Headline(headline::HeadlineArgs),
     /// How often the fit's 95 % intervals hold the truth
     Coverage(coverage::CoverageArgs),
 }
@@ -33,6 +36,7 @@ pub fn run(command: &BenchCommand) -> Result<()> {
         BenchCommand::Stereo(args) => stereo::run(args),
         BenchCommand::Fit(args) => fit::run(args),
         BenchCommand::Sweeps(args) => sweeps::run(args),
+        BenchCommand::Headline(args) => headline::run(args),
         BenchCommand::Coverage(args) => coverage::run(args),
     }
 }

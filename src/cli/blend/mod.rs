@@ -118,9 +118,9 @@ fn save_strip(path: &Path, space: &Space, motions: &[Made]) -> Result<()> {
     let mut rows = Vec::new();
     for (m, (clip, blend)) in motions.iter().zip(&played) {
         let made = Phases { clip, cycle_s: blend.duration_s() };
-        rows.push(Strip { label: m.label.clone(), made, recorded: None, cyclic: blend.is_cyclic() });
+        rows.push(Strip { label: m.label.clone(), made, below: None, cyclic: blend.is_cyclic() });
     }
-    let picture = strips(&rows, FIGURES, FROM_THE_FRONT_RIGHT)?.picture()?;
+    let picture = strips(&rows, FIGURES, FROM_THE_FRONT_RIGHT, "")?.picture()?;
     Ok(report::save(path, &picture)?)
 }
 

@@ -3,8 +3,9 @@
 use anyhow::{Result, bail};
 use muybridge::body::{Joint, Length, Pose, PosedSurface, Shape, Surface, place};
 use muybridge::math::rotation::exp;
+use muybridge::motion::Synthesis;
 use muybridge::motion_model::synthetic::REPEATS;
-use muybridge::motion_model::{Cycle, Model, SAMPLES};
+use muybridge::motion_model::{Cycle, Detail, Model, SAMPLES};
 use muybridge::phantom::truth::{ANGLES, JointErrors, Positions, distance_to_skin, joint_errors};
 use muybridge::style::{Metric, Population, Style};
 use nalgebra::{DVector, Vector3};
@@ -12,7 +13,7 @@ use rayon::prelude::*;
 
 use super::table::Row;
 use super::{Generated, SPEED_M_S, Truth, at_speed};
-use crate::cli::track::{NamedModel, Tracked};
+use crate::cli::track::{self, NamedModel, Tracked};
 
 /// Points of one frame whose distance to the skin is measured.
 const POINTS: usize = 2000;
@@ -134,7 +135,7 @@ fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row>
 
 /// The generated cycles against the subject's own true motion at those speeds, on the true body.
 fn speed_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
-    let found = &tracked.fit.state.weights;
+    let own = track::style(&tracked.fit, model);
     let Some(true_style) = Style::of_cycles(&model.model, &model.hash, std::slice::from_ref(&truth.cycle)) else {
         bail!("the filmed person has no cycle");
     };
@@ -142,14 +143,17 @@ fn speed_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &
     for motion in generated {
         let speed_m_s = motion.kmh / 3.6;
         let wanted = truth.subject.mean_cycle(speed_m_s);
-        let error = |weights: &[f64]| against(truth, &model.model.cycle(weights, "", speed_m_s, 1.0, 1.0), &wanted);
+        let error = |weights: &[f64], detail: Option<&Detail>| {
+            against(truth, &model.model.cycle_with(weights, detail, speed_m_s, 1.0, 1.0), &wanted)
+        };
+        let error_of = |s: &Synthesis| error(s.weights.as_slice(), s.detail.as_ref());
         let cadence = |frequency_hz: f64| 100.0 * (frequency_hz * wanted.duration_s - 1.0).abs();
         let from_truth = at_speed(model, &true_style, speed_m_s)?;
-        let made = error(motion.synthesis.weights.as_slice());
+        let made = error_of(&motion.synthesis);
         let beside = [
-            (TRUE_STYLE, error(from_truth.weights.as_slice())),
-            (UNCHANGED, error(found)),
-            (AVERAGE, error(average_person(&model.model, found.len(), speed_m_s).as_slice())),
+            (TRUE_STYLE, error_of(&from_truth)),
+            (UNCHANGED, error(&own.weights, own.detail.as_ref())),
+            (AVERAGE, error(average_person(&model.model, own.weights.len(), speed_m_s).as_slice(), None)),
         ];
         let row = |what: &str, unit, of: &dyn Fn(&JointErrors) -> f64| Row {
             quantity: format!("at {} km/h, {what}", motion.kmh),

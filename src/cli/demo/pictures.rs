@@ -9,8 +9,9 @@ use muybridge::motion_model::{Cycle, SAMPLES};
 use muybridge::phantom::DepthMap;
 use muybridge::report::{self, Curve};
 
-use super::{Generated, SPEED_M_S, Truth};
-use crate::cli::track::{NamedModel, Tracked};
+use super::{Generated, Truth};
+use crate::cli::outputs::own_cycle;
+use crate::cli::track::{self, NamedModel, Tracked};
 
 /// Figures of one row of the speeds, over this time.
 const FIGURES: usize = 7;
@@ -33,7 +34,7 @@ pub fn draw(
 }
 
 fn angles(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Result<image::RgbImage> {
-    let found = model.model.cycle(&tracked.fit.state.weights, "", SPEED_M_S, 1.0, 1.0);
+    let found = own_cycle(&model.model, &track::style(&tracked.fit, model));
     let mut series = Vec::new();
     // The knee bends backwards: turns the other way about the axis to the left.
     for (colour, (name, joint, sign)) in [("hip", Joint::RHip, -1.0), ("knee", Joint::RKnee, 1.0)].into_iter().enumerate() {
