@@ -72,19 +72,6 @@ impl Curve {
         }
     }
 
-    /// The same without what the components add to joints all cycle long; the mean takes that on as it is at `weights`.
-    pub fn without_posture(mut self, weights: &[f64]) -> Curve {
-        let (mean, components) = self.functions.split_at_mut(1);
-        for (component, weight) in components.iter_mut().zip(weights) {
-            for channel in 0..DOF {
-                let constant = component.row(channel).mean();
-                component.row_mut(channel).add_scalar_mut(-constant);
-                mean[0].row_mut(channel).add_scalar_mut(weight * constant);
-            }
-        }
-        self
-    }
-
     pub fn components(&self) -> usize {
         self.eigenvalues.len()
     }
