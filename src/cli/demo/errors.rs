@@ -29,7 +29,7 @@ const AVERAGE: &str = "average person";
 /// What the table's words mean.
 pub const NOTES: &str = "
 Angles are included angles at joint centres, means of both sides; joints at new speeds: pelvis moved together.
-model alone: the true cycle as the model's components show it; true style: generated from the true cycle's weights;
+model alone: the true cycle as the model's components show it; true style: generated from the true cycle;
 unchanged: the recovered motion replayed as filmed; average person: mean of the database's people at that speed.
 ";
 
