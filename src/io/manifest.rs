@@ -1,7 +1,8 @@
 //! Which motion files make a database: folders searched, and `subjects.csv` that says what the files hold.
 //!
 //! Columns `file,subject,activity,speed_m_s,length_m,start_s,end_s` in any order, all but `file` optional, empty cells
-//! allowed; `file` is relative to the manifest, and below its folder in a manifest that was found there and not named. A file may have several rows. A `subjects.csv` found in a folder stands for
+//! allowed; `file` is relative to the manifest, and below its folder in a manifest that was found there and not named.
+//! A file may have several rows. A `subjects.csv` found in a folder stands for
 //! the whole folder: only the files it lists are used. A trial that lies in one folder as C3D and as TRC counts once.
 
 use std::collections::BTreeSet;

@@ -11,7 +11,7 @@
 
 use std::ops::Range;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 
 use crate::body::{Clip, Joint};
 use crate::math::order::quantile;
@@ -37,7 +37,6 @@ const TRAVEL_S: f64 = 0.5;
 pub struct FootTrack {
     pub ankle: Joint,
     pub ankles: Vec<Vector3<f64>>,
-    pub world_from_foot: Vec<UnitQuaternion<f64>>,
     /// Heel, ball and toe tip, see [`Clip::sole_points`], on the floor while they rest.
     pub soles: Vec<[Vector3<f64>; 3]>,
 }
@@ -45,14 +44,13 @@ pub struct FootTrack {
 impl FootTrack {
     /// Of the foot of `ankle`, LAnkle or RAnkle.
     pub fn new(clip: &Clip, ankle: Joint) -> FootTrack {
-        let mut track = FootTrack { ankle, ankles: Vec::new(), world_from_foot: Vec::new(), soles: Vec::new() };
+        let mut track = FootTrack { ankle, ankles: Vec::new(), soles: Vec::new() };
         let ball = if ankle == Joint::LAnkle { Joint::LMidtarsal } else { Joint::RMidtarsal };
         let mut ups: Vec<[Vector3<f64>; 3]> = Vec::new();
         for pose in &clip.poses {
             let placed = clip.place(pose);
             let up = |joint: Joint| placed.world_from_node[joint as usize] * Vector3::y();
             track.ankles.push(placed.position(ankle));
-            track.world_from_foot.push(placed.world_from_node[ankle as usize]);
             track.soles.push(clip.sole_points(&placed, ankle));
             ups.push([up(ankle), up(ball), up(ball)]);
         }
