@@ -1,9 +1,11 @@
 //! The animal pipeline as a zoologist runs it, on a rendered horse: masks, verdict, keys, poses, animation; wrong input.
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use assert_cmd::Command;
+use common::run;
 use image::{GrayImage, Rgb, RgbImage};
 use muybridge::animal::creature::{Creature, Local, Motion, Posture};
 use muybridge::animal::horse::{Gait, horse};
@@ -14,12 +16,6 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 const SIZE: [u32; 2] = [240, 180];
-
-fn run(arguments: &[&str]) -> (bool, String, String) {
-    let output = Command::cargo_bin("muybridge").unwrap().args(arguments).output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.success(), text(&output.stdout), text(&output.stderr))
-}
 
 fn fine(arguments: &[&str]) -> String {
     let (done, out, error) = run(arguments);

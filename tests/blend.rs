@@ -1,9 +1,11 @@
 //! The vector space of motions on recorded walks, and the command `blend` as a user runs it. Recordings lie beside the project;
 //! without them their tests say so and pass.
 
+mod common;
+
 use std::path::{Path, PathBuf};
 
-use assert_cmd::Command;
+use common::{mocap, run};
 use muybridge::body::{Joint, Pose, Shape, place};
 use muybridge::io::read_clip;
 use muybridge::math::rotation::exp;
@@ -12,15 +14,6 @@ use muybridge::style::space::attributes::{direction, spread};
 use muybridge::style::space::measure::measure;
 use muybridge::style::space::{Blend, Example, Live, Method, Options, Posture, Space, Vectors, manipulate};
 use nalgebra::Vector3;
-
-fn mocap(folder: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap").join(folder);
-    if !path.exists() {
-        println!("skipped: {} is not there", path.display());
-        return None;
-    }
-    Some(path)
-}
 
 fn cycles(path: &Path, part_s: Option<(f64, f64)>) -> Vec<Cycle> {
     let clip = read_clip(path).unwrap().clip;
@@ -210,12 +203,6 @@ fn round_trip(blend: &Blend, example: &Example) {
     off_deg.sort_by(f64::total_cmp);
     let at = |share: f64| off_deg[(share * (off_deg.len() - 1) as f64) as usize];
     assert!(at(0.5) < 0.1 && at(0.98) < 1.0, "{}: {} {}", example.name, at(0.5), at(0.98));
-}
-
-fn run(arguments: &[&str]) -> (bool, String, String) {
-    let output = Command::cargo_bin("muybridge").unwrap().args(arguments).output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.success(), text(&output.stdout), text(&output.stderr))
 }
 
 /// A folder with the synthetic walkers 1 to 4 as BVH files and their labels.

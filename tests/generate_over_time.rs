@@ -1,8 +1,10 @@
 //! `generate` along profiles and bends, with planted feet, and recorded jumps at other lengths, as a user runs it.
 
+mod common;
+
 use std::path::{Path, PathBuf};
 
-use assert_cmd::Command;
+use common::{mocap, path, run};
 use muybridge::body::{Joint, Pose};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
@@ -11,16 +13,6 @@ use muybridge::motion::{Length, play_cycle, synthesize};
 use muybridge::motion_model::{Activity, Cycle, Detail, Label, Model, database, segment, synthetic};
 use muybridge::style::{Method, Metric, Population, Style};
 use nalgebra::DVector;
-
-fn run(arguments: &[&str]) -> (bool, String, String) {
-    let output = Command::cargo_bin("muybridge").unwrap().args(arguments).output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.success(), text(&output.stdout), text(&output.stderr))
-}
-
-fn path(folder: &Path, name: &str) -> String {
-    folder.join(name).to_string_lossy().into_owned()
-}
 
 /// The synthetic model of an activity and the style of one who is not in it.
 fn model_and_style(folder: &Path, activity: Activity, speed: f64) -> (String, String) {
@@ -178,14 +170,6 @@ fn what_cannot_be_followed_is_one_sentence() {
         let (done, _, error) = run(&arguments);
         assert!(!done && error.contains(part) && !Path::new(&out).exists(), "{options:?}: {error}");
     }
-}
-
-fn mocap(folder: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap").join(folder);
-    if !path.exists() {
-        println!("skipped: {} is not there", path.display());
-    }
-    path.exists().then_some(path)
 }
 
 fn cut(file: &Path, activity: Activity) -> Vec<Cycle> {

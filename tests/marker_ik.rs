@@ -1,7 +1,10 @@
 //! Inverse kinematics of markers against the data sets' own (OpenSim), and of a known clip through noise, gaps and exchanges.
 
-use std::path::{Path, PathBuf};
+mod common;
 
+use std::path::Path;
+
+use common::mocap;
 use muybridge::body::{Clip, Joint, Pose};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::markers::read;
@@ -13,14 +16,6 @@ use muybridge::motion_model::{Activity, Label, segment, synthetic};
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-
-fn shared(folder: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap").join(folder);
-    if !path.is_dir() {
-        println!("skipped: no ../shared/data/mocap/{folder}");
-    }
-    path.is_dir().then_some(path)
-}
 
 fn solved(markers: &Markers) -> Solved {
     let sets = MarkerSet::supplied().unwrap();
@@ -90,7 +85,7 @@ fn agree(name: &str, solved: &Solved, found: &[(f64, f64); 6]) {
 
 #[test]
 fn runners_agree_with_their_own_inverse_kinematics() {
-    let Some(data) = shared("hamner-running") else { return };
+    let Some(data) = mocap("hamner-running") else { return };
     println!("{HEAD}");
     for (subject, speed) in [("subject01", 3), ("subject01", 5), ("subject03", 2), ("subject03", 4)] {
         let (mut markers, _) = read(&data.join(subject).join(format!("expData/Run_{speed}.trc"))).unwrap();
@@ -125,7 +120,7 @@ const WALKS: [&str; 18] = [
 
 #[test]
 fn walkers_agree_with_their_own_inverse_kinematics() {
-    let Some(data) = shared("schreiber-walking") else { return };
+    let Some(data) = mocap("schreiber-walking") else { return };
     println!("{HEAD}");
     for trial in WALKS {
         let (subject, name) = trial.split_at(7);

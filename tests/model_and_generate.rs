@@ -1,18 +1,10 @@
 //! The commands `model` and `generate` as a user runs them, on the synthetic database.
 
+mod common;
+
 use std::path::Path;
 
-use assert_cmd::Command;
-
-fn run(arguments: &[&str]) -> (bool, String, String) {
-    let output = Command::cargo_bin("muybridge").unwrap().args(arguments).output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.success(), text(&output.stdout), text(&output.stderr))
-}
-
-fn path(folder: &Path, name: &str) -> String {
-    folder.join(name).to_string_lossy().into_owned()
-}
+use common::{path, run};
 
 /// Speed over the floor of a written BVH, from its root channels alone.
 fn root_speed_m_s(bvh: &Path) -> f64 {

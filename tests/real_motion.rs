@@ -1,7 +1,8 @@
 //! Motion models from recorded walks and runs. Data lie beside the project; without them the tests say so and pass.
 
-use std::path::{Path, PathBuf};
+mod common;
 
+use common::mocap;
 use muybridge::body::{Clip, Pose};
 use muybridge::io::manifest::{Entry, find_motions};
 use muybridge::io::read_clip;
@@ -9,15 +10,6 @@ use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, CadenceLaw, Cycle, Label, Model, SAMPLES, database, segment, synthetic};
 use muybridge::style::validate::validate;
 use nalgebra::Vector3;
-
-fn mocap(folder: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap").join(folder);
-    if !path.exists() {
-        println!("skipped: {} is not there", path.display());
-        return None;
-    }
-    Some(path)
-}
 
 fn cut(entry: &Entry, activity: Activity) -> Vec<Cycle> {
     let clip = read_clip(&entry.path).unwrap().clip;

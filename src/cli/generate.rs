@@ -16,7 +16,7 @@ use muybridge::motion_model::{Activity, Model};
 use muybridge::report::generated::{self, GeneratedReport};
 use muybridge::style::{Method, Metric, Population, Style};
 
-use super::manner::MannerArgs;
+use super::manner::{Manner, MannerArgs};
 use super::model::default_variance;
 use super::motions::{file_name, read_recordings};
 use super::outputs::{Made, OutputArgs};
@@ -124,21 +124,21 @@ pub fn run(args: GenerateArgs) -> Result<()> {
         let (path, recorded_at) = text.rsplit_once('@').map_or((text.as_str(), None), |(path, at)| (path, Some(at)));
         style = style.and(load_style(&args.model, &model, Path::new(path), recorded_at)?);
     }
-    let shape = target_shape(&args, &style);
+    let (shape, manner) = (target_shape(&args, &style), args.manner.read()?);
     match &args.profile {
         Some(text) => {
-            let profile = profile::read(text, args.turn_radius)?.with_amounts(args.manner.courses()?);
-            along_profile(&args, &model, &style, &shape, &profile)
+            let profile = profile::read(text, args.turn_radius)?.with_amounts(manner.courses.clone());
+            along_profile(&args, &manner, &model, &style, &shape, &profile)
         }
-        None => at_values(&args, &model, &style, &shape, &values),
+        None => at_values(&args, &manner, &model, &style, &shape, &values),
     }
 }
 
-fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, values: &[f64]) -> Result<()> {
+fn at_values(args: &GenerateArgs, manner: &Manner, model: &Model, style: &Style, shape: &Shape, values: &[f64]) -> Result<()> {
     let names = file_names(model.activity, values)?;
     let (population, method) = (population(args, model, style)?, method(args)?);
     let length = args.seconds.map_or(Length::Cycles(args.cycles.into()), Length::Seconds);
-    let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,nearest_subject,nearest_share\n");
+    let mut table = String::from("file,value,unit,cycle_frequency_hz,hip_height_m,components,angle_sd_deg,nearest_subject,nearest_share\n");
     let (mut motions, mut syntheses) = (Vec::new(), Vec::new());
     for (value, name) in values.iter().zip(&names) {
         let mut synthesis = synthesize(model, &population, method, style, *value, shape.hip_height_m())?;
@@ -149,11 +149,10 @@ fn at_values(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, v
             play(model, &synthesis, &shape.offsets(), args.fps, length)
         } else {
             let mut gait = Gait::steady(model, &synthesis, &shape.offsets()).context("no gait at this speed")?;
-            args.manner.teach(&mut gait, || Gait::typical(model, &population, shape.hip_height_m(), &shape.offsets()), *value)?;
-            let courses = args.manner.courses()?;
-            synthesis.frequency_hz *= gait.cadence_factor(courses.iter().map(|c| c.at(0.0)));
+            manner.teach(&mut gait, || Gait::typical(model, &population, shape.hip_height_m(), &shape.offsets()), *value)?;
+            synthesis.frequency_hz *= gait.cadence_factor(manner.courses.iter().map(|c| c.at(0.0)));
             let seconds = length.seconds(synthesis.frequency_hz);
-            let profile = Profile::steady(*value, args.turn_radius.map_or(0.0, f64::recip), seconds)?.with_amounts(courses);
+            let profile = Profile::steady(*value, args.turn_radius.map_or(0.0, f64::recip), seconds)?.with_amounts(manner.courses.clone());
             follow(&Gaits::one(gait), &profile, &shape.offsets(), args.fps).0
         };
         let clip = planted(args, name, clip);
@@ -192,10 +191,10 @@ fn report(args: &GenerateArgs, model: &Model, style: &Style, made: Vec<generated
 }
 
 /// One motion whose speed varies over time.
-fn along_profile(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape, profile: &Profile) -> Result<()> {
-    let own = gait(args, model, style, shape)?;
+fn along_profile(args: &GenerateArgs, manner: &Manner, model: &Model, style: &Style, shape: &Shape, profile: &Profile) -> Result<()> {
+    let own = gait(args, manner, model, style, shape)?;
     let gaits = match &args.run_model {
-        Some(path) => Gaits::walk_and_run(own, running(args, path, shape)?),
+        Some(path) => Gaits::walk_and_run(own, running(args, manner, path, shape)?),
         None => Gaits::one(own),
     };
     let fastest_m_s = gaits.fast().unwrap_or(&gaits.slow).range_m_s().1;
@@ -230,7 +229,7 @@ fn steps_csv(steps: &[Step]) -> String {
     table
 }
 
-fn gait(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Result<Gait> {
+fn gait(args: &GenerateArgs, manner: &Manner, model: &Model, style: &Style, shape: &Shape) -> Result<Gait> {
     let population = population(args, model, style)?;
     let found = Gait::of_style(model, &population, method(args)?, style, shape.hip_height_m(), &shape.offsets())?;
     let (mut gait, notice) = found.with_context(|| format!("the speeds of {} make no gait", model.activity))?;
@@ -238,25 +237,25 @@ fn gait(args: &GenerateArgs, model: &Model, style: &Style, shape: &Shape) -> Res
         eprintln!("notice: {notice}");
     }
     let typical = || Gait::typical(model, &population, shape.hip_height_m(), &shape.offsets());
-    args.manner.teach(&mut gait, typical, style.parameter * shape.hip_height_m() / style.hip_height_m)?;
+    manner.teach(&mut gait, typical, style.parameter * shape.hip_height_m() / style.hip_height_m)?;
     Ok(gait)
 }
 
 /// Running of the same body: the person's own, else that of the running model's people on average.
-fn running(args: &GenerateArgs, path: &Path, shape: &Shape) -> Result<Gait> {
+fn running(args: &GenerateArgs, manner: &Manner, path: &Path, shape: &Shape) -> Result<Gait> {
     let model = read_model(path)?;
     if model.activity != Activity::Running {
         bail!("{} is a model of {}, not of running", path.display(), model.activity);
     }
     if let Some(file) = &args.run_style {
-        return gait(args, &model, &load_style(path, &model, file, args.run_recorded_at.as_deref())?, shape);
+        return gait(args, manner, &model, &load_style(path, &model, file, args.run_recorded_at.as_deref())?, shape);
     }
     eprintln!("notice: no --run-style, so the person runs as the people of {} do on average", path.display());
     let population = Population::new(&model, model.components(1.0));
     let typical = Gait::typical(&model, &population, shape.hip_height_m(), &shape.offsets());
     let mut gait = typical.context("the speeds of running make no gait")?;
     let (own, slowest_m_s) = (gait.clone(), gait.range_m_s().0);
-    args.manner.teach(&mut gait, || Some(own), slowest_m_s)?;
+    manner.teach(&mut gait, || Some(own), slowest_m_s)?;
     Ok(gait)
 }
 
@@ -288,7 +287,8 @@ fn table_row(name: &str, model: &Model, s: &Synthesis) -> String {
     let unit = if model.activity.is_cyclic() { "m/s" } else { "m" };
     let nearest = s.shares.iter().max_by(|a, b| a.1.total_cmp(&b.1));
     let (subject, share) = nearest.map_or(("", 0.0), |n| (n.0.as_str(), n.1));
-    format!("{name},{},{unit},{:.6},{:.4},{},{subject},{share:.4}", s.parameter, s.frequency_hz, s.hip_height_m, s.weights.len())
+    let sd = s.angle_sd().map_or(String::new(), |sd| format!("{:.3}", sd.to_degrees()));
+    format!("{name},{},{unit},{:.6},{:.4},{},{sd},{subject},{share:.4}", s.parameter, s.frequency_hz, s.hip_height_m, s.weights.len())
 }
 
 fn load_style(model_path: &Path, model: &Model, path: &Path, recorded_at: Option<&str>) -> Result<Style> {

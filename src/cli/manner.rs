@@ -77,9 +77,31 @@ impl FromStr for Amount {
     }
 }
 
+/// What [`MannerArgs`] ask for, read once for all motions.
+pub struct Manner<'a> {
+    args: &'a MannerArgs,
+    /// The space with one standard deviation more of every attribute that is asked for, the others held.
+    space: Option<(Space, Vec<Vectors>)>,
+    /// Amounts over time, in the order in which [`Manner::teach`] adds the changes.
+    pub courses: Vec<Course>,
+}
+
 impl MannerArgs {
     pub fn is_plain(&self) -> bool {
         self.attribute.is_empty() && self.caricature.is_none()
+    }
+
+    /// Reads the space.
+    pub fn read(&self) -> Result<Manner<'_>> {
+        let space = self.space.as_ref().map(|path| {
+            let space = read_space(path)?;
+            if !space.layout.cyclic {
+                bail!("{} is a space of whole motions; attributes of gaits need one of cycles", file_name(path));
+            }
+            let units = self.attribute.iter().map(|knob| unit(&space, &knob.name)).collect::<Result<Vec<_>>>()?;
+            Ok((space, units))
+        });
+        Ok(Manner { args: self, space: space.transpose()?, courses: self.courses()? })
     }
 
     /// Attributes that stay as they are make one change together.
@@ -87,8 +109,7 @@ impl MannerArgs {
         !self.attribute.is_empty() && self.attribute.iter().all(|knob| knob.amount.0.len() == 1)
     }
 
-    /// Amounts over time, in the order in which [`MannerArgs::teach`] adds the changes.
-    pub fn courses(&self) -> Result<Vec<Course>> {
+    fn courses(&self) -> Result<Vec<Course>> {
         let scaled = |a: &Amount, f: &dyn Fn(f64) -> f64| a.0.iter().map(|(t, v)| (*t, f(*v))).collect();
         let sides = |knob: &Knob| knob.amount.sides().map(|side| scaled(&knob.amount, &|v| (v / side).max(0.0))).collect::<Vec<_>>();
         let mut all: Vec<Vec<(f64, f64)>> =
@@ -96,11 +117,13 @@ impl MannerArgs {
         all.extend(self.caricature.iter().map(|degree| scaled(degree, &|v| v - 1.0)));
         Ok(all.into_iter().map(Course::new).collect::<Result<_, _>>()?)
     }
+}
 
+impl Manner<'_> {
     /// Adds the changes to a gait; `typical` is that of the model's people on average, and `speed_m_s` where the two are compared.
     pub fn teach(&self, gait: &mut Gait, typical: impl FnOnce() -> Option<Gait>, speed_m_s: f64) -> Result<()> {
-        let mut changes = self.attributes(gait)?;
-        if self.caricature.is_some() {
+        let mut changes = self.attributes(gait);
+        if self.args.caricature.is_some() {
             changes.push(gait.difference(&typical().context("the model's people make no gait")?, speed_m_s));
         }
         for change in changes {
@@ -110,23 +133,16 @@ impl MannerArgs {
     }
 
     /// All attributes together where they are steady, else the most and the least wanted of each: what `blend attribute` makes.
-    fn attributes(&self, gait: &Gait) -> Result<Vec<Change>> {
-        let Some(path) = &self.space else { return Ok(Vec::new()) };
-        let space = read_space(path)?;
-        if !space.layout.cyclic {
-            bail!("{} is a space of whole motions; attributes of gaits need one of cycles", file_name(path));
-        }
-        let units = self.attribute.iter().map(|knob| unit(&space, &knob.name)).collect::<Result<Vec<_>>>()?;
+    fn attributes(&self, gait: &Gait) -> Vec<Change> {
+        let Some((space, units)) = &self.space else { return Vec::new() };
         let mean = space.mean();
         let change = |to: &Vectors| gait.change(&space.play(&mean), &space.play(to));
-        let knobs = || self.attribute.iter().zip(&units);
-        if self.is_steady() {
+        let knobs = || self.args.attribute.iter().zip(units);
+        if self.args.is_steady() {
             let all = knobs().flat_map(|(knob, unit)| knob.amount.0.iter().map(move |point| (point.1, unit)));
-            return Ok(vec![change(&all.fold(mean.clone(), |sum, (amount, unit)| sum.plus(unit, amount, amount)))]);
+            return vec![change(&all.fold(mean.clone(), |sum, (amount, unit)| sum.plus(unit, amount, amount)))];
         }
-        Ok(knobs()
-            .flat_map(|(knob, unit)| knob.amount.sides().map(|side| change(&mean.plus(unit, side, side))).collect::<Vec<_>>())
-            .collect())
+        knobs().flat_map(|(knob, unit)| knob.amount.sides().map(|side| change(&mean.plus(unit, side, side))).collect::<Vec<_>>()).collect()
     }
 }
 

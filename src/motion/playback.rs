@@ -11,9 +11,9 @@
 
 use nalgebra::{DVector, UnitQuaternion, Vector3};
 
-use crate::body::{BALL_JOINTS, Clip, NODES, Pose};
+use crate::body::{BALL_JOINTS, Clip, DOF, NODES, Pose};
 use crate::math::rotation::exp;
-use crate::motion_model::{Cycle, Detail, Model, RootSample};
+use crate::motion_model::{Cycle, Detail, Model, RootSample, SAMPLES};
 use crate::style::{Extrapolation, Method, Population, Style, StyleError};
 
 /// A jump's progress is only stretched by factors in this range: beyond, the weights describe another kind of jump.
@@ -36,6 +36,15 @@ pub struct Synthesis {
     /// Database subjects and their weights of equation (7).
     pub shares: Vec<(String, f64)>,
     pub notice: Option<String>,
+}
+
+impl Synthesis {
+    /// Standard deviation of the joint coordinates that the prediction leaves open, rad, root mean square over all and the
+    /// whole cycle: the components are orthonormal. The paper's scheme has none.
+    pub fn angle_sd(&self) -> Option<f64> {
+        let squares: f64 = self.sd.as_ref()?.iter().map(|sd| sd * sd).sum();
+        Some((squares / (SAMPLES * DOF) as f64).sqrt())
+    }
 }
 
 /// How much to play.

@@ -7,6 +7,7 @@ pub mod departure;
 pub mod gait;
 pub mod markers;
 pub mod model;
+pub mod postures;
 pub mod segment;
 pub mod synthetic;
 
@@ -15,4 +16,5 @@ pub use cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES};
 pub use departure::Departure;
 pub use gait::{Gait, gait};
 pub use model::{Detail, Member, Model, ModelError};
+pub use postures::Postures;
 pub use segment::{Label, Segments, overground, segment};

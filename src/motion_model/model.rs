@@ -362,7 +362,7 @@ fn rotations(means: &[UnitQuaternion<f64>; BALL_JOINTS], coordinates: &[f64]) ->
 /// Terms of the series below: at half a turn the next one is 1e-17.
 const TERMS: usize = 11;
 /// 1/(2k)! and 1/(2k+1)! with alternating signs.
-const SERIES: ([f64; TERMS], [f64; TERMS]) = {
+pub(super) const SERIES: ([f64; TERMS], [f64; TERMS]) = {
     let (mut even, mut odd) = ([1.0; TERMS], [1.0; TERMS]);
     let mut k = 1;
     while k < TERMS {
@@ -374,11 +374,14 @@ const SERIES: ([f64; TERMS], [f64; TERMS]) = {
     (even, odd)
 };
 
-/// exp of a rotation vector by the series of cos and sin(h)/h, h half the angle: neither roots nor branches, which is what a
-/// million postures a second need. Beyond half a turn, where the series fades, the closed form.
+/// Squared angle, nearly half a turn, beyond which the series fade.
+pub(super) const FADING: f64 = 9.8;
+
+/// exp of a rotation vector by the series of cos and sin(h)/h, h half the angle: neither roots nor branches, which is what
+/// many postures a second need. Beyond half a turn, where the series fades, the closed form.
 fn turn(x: f64, y: f64, z: f64) -> UnitQuaternion<f64> {
     let square = x * x + y * y + z * z;
-    if square > 9.8 {
+    if square > FADING {
         return exp(&Vector3::new(x, y, z));
     }
     let h2 = 0.25 * square;

@@ -11,6 +11,8 @@ use crate::style::validate::Score;
 
 /// Components whose share of the variance is drawn.
 const EXPLAINED: usize = 40;
+/// Size of a subject's name.
+const NAME_PX: f64 = 8.0;
 /// Points of a subject's curve.
 const STEPS: u32 = 60;
 
@@ -69,11 +71,39 @@ fn coefficient(model: &Model, population: &Population, i: usize, width: f64, hei
         for dot in dots(k) {
             canvas.disc(frame.pixel(dot), 4.0, colour)?;
         }
-        if let Some(&[x, y]) = pixels.last() {
-            canvas.text([x - 6.0, y - 8.0], &curve.label, 8.0, INK, Align::Right)?;
-        }
+    }
+    // Curves end where their people's recordings do; names that would cover each other make way.
+    let ends = lines.iter().filter_map(|c| Some((&c.label, frame.pixel(*c.points.last()?))));
+    let mut names: Vec<(&String, [f64; 2])> = ends.map(|(label, [x, y])| (label, [x - 6.0, y - 8.0])).collect();
+    names.sort_by(|a, b| a.1[1].total_cmp(&b.1[1]));
+    let widths = names.iter().map(|(label, _)| text_width_px(label, NAME_PX)).collect::<Result<Vec<f64>, _>>()?;
+    make_way(&mut names.iter_mut().map(|n| &mut n.1).collect::<Vec<_>>(), &widths, 1.6 * NAME_PX);
+    for (label, at) in names {
+        canvas.text(at, label, NAME_PX, INK, Align::Right)?;
     }
     Ok(canvas.picture)
+}
+
+/// Moves texts that end at `ends`, sorted by height, apart to lines of `line` pixels where they overlap across.
+fn make_way(ends: &mut [&mut [f64; 2]], widths: &[f64], line: f64) {
+    for _ in 0..100 {
+        let mut moved = false;
+        for k in 1..ends.len() {
+            for i in 0..k {
+                let left = |n: usize, ends: &[&mut [f64; 2]]| ends[n][0] - widths[n];
+                let beside = left(k, ends) > ends[i][0] || left(i, ends) > ends[k][0];
+                let short = line - (ends[k][1] - ends[i][1]);
+                if !beside && short > 0.01 {
+                    ends[i][1] -= 0.5 * short;
+                    ends[k][1] += 0.5 * short;
+                    moved = true;
+                }
+            }
+        }
+        if !moved {
+            break;
+        }
+    }
 }
 
 /// One column per left-out subject, one mark per method (Figure 8); `metric` of the scores with its label and unit.

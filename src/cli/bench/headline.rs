@@ -14,6 +14,7 @@ use muybridge::body::{Pose, Shape};
 use muybridge::fit::{self, Fit, FitOptions};
 use muybridge::io::manifest::{Entry, find_motions};
 use muybridge::io::session::Session;
+use muybridge::io::style_json::write_style;
 use muybridge::io::{calib_toml, read_clip, write_atomic};
 use muybridge::motion::{Length, play, synthesize};
 use muybridge::motion_model::{Activity, Cycle, Detail, Member, Model, overground};
@@ -59,7 +60,7 @@ pub struct HeadlineArgs {
     /// Components of the model that the fit uses
     #[arg(long, default_value_t = FitOptions::default().components)]
     components: usize,
-    /// Folder for headline.csv and for each person the footage, what was tracked, the strips and angles.csv
+    /// Folder for headline.csv and for each person the footage, what was tracked, style.json, the strips and angles.csv
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
 }
@@ -140,6 +141,7 @@ impl<'a> Person<'a> {
         let fit = self.track(args, &folder)?;
         let (model, hash) = (&self.others.model, &self.others.hash);
         let tracked = track::style(&fit, &self.others);
+        write_style(&folder.join("style.json"), &tracked)?;
         let recorded = Style::of_cycles(model, hash, &self.seen).context("no cycle at the filmed speed")?;
         println!(
             "{} filmed at {:.2} m/s, {} frames; tracked at {:.2} m/s and {:.2} cycles/s with the model of {} others",

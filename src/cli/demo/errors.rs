@@ -33,12 +33,12 @@ model alone: the true cycle as the model's components show it; true style: gener
 unchanged: the recovered motion replayed as filmed; average person: mean of the database's people at that speed.
 ";
 
-pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
+pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, own: &Style, generated: &[Generated]) -> Result<Vec<Row>> {
     let mut rows = cloud_rows(truth, tracked)?;
     rows.extend(joint_rows(truth, model, tracked));
     rows.extend(motion_rows(truth, tracked));
     rows.extend(weight_rows(truth, model, tracked));
-    rows.extend(speed_rows(truth, model, tracked, generated)?);
+    rows.extend(speed_rows(truth, model, own, generated)?);
     Ok(rows)
 }
 
@@ -134,8 +134,7 @@ fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row>
 }
 
 /// The generated cycles against the subject's own true motion at those speeds, on the true body.
-fn speed_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
-    let own = track::style(&tracked.fit, model);
+fn speed_rows(truth: &Truth, model: &NamedModel, own: &Style, generated: &[Generated]) -> Result<Vec<Row>> {
     let Some(true_style) = Style::of_cycles(&model.model, &model.hash, std::slice::from_ref(&truth.cycle)) else {
         bail!("the filmed person has no cycle");
     };

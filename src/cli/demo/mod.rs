@@ -112,9 +112,9 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
         })
     })?;
     let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default(), None))?;
-    let generated = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
+    let (style, generated) = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
     let rows = clock.time("errors and pictures", || {
-        let rows = errors::rows(&truth, &model, &tracked, &generated)?;
+        let rows = errors::rows(&truth, &model, &tracked, &style, &generated)?;
         track::draw(&folder.join("pictures"), &session.rig, &model, &tracked)?;
         pictures::draw(&folder.join("pictures"), &truth, &model, &tracked, &generated, tracked.depth.as_ref().map(|d| &d.1))?;
         Ok(rows)
@@ -153,8 +153,8 @@ fn announce(session: &Session) -> Result<()> {
     Ok(())
 }
 
-/// Writes what `track` and `generate` write.
-fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<Vec<Generated>> {
+/// Writes what `track` and `generate` write; returns the tracked person's style and the motions made of it.
+fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<(Style, Vec<Generated>)> {
     track::write(&folder.join("track"), session, model, tracked)?;
     track_report::write(&folder.join("track"), session, model, tracked)?;
     let style = track::style(&tracked.fit, model);
@@ -165,7 +165,8 @@ fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Trac
         bvh::write_clip(&folder.join(format!("generated/walking_{kmh}kmh.bvh")), &clip, None)?;
         Ok(Generated { kmh, synthesis, clip })
     };
-    WANTED_KMH.into_iter().map(one).collect()
+    let generated = WANTED_KMH.into_iter().map(one).collect::<Result<_>>()?;
+    Ok((style, generated))
 }
 
 /// As `muybridge generate` does it without options.

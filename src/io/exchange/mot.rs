@@ -23,7 +23,7 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use nalgebra::{DMatrix, DVector, Matrix4, Matrix6x4, UnitQuaternion, Vector3, Vector4, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix4, SMatrix, SVector, UnitQuaternion, Vector3, Vector4};
 
 use super::super::mot::{ANKLE, ELBOW, HIP_FORWARD, HIP_UP, PRONATION, SUBTALAR, TOES, X, Y, Z, ours};
 use super::{ExchangeError, opensim_from_clip};
@@ -161,8 +161,9 @@ impl Found<'_> {
         parent * product(axes, &angles)
     }
 
-    /// The upper arm's three angles and the elbow's. The model's elbow bends about an axis 13 degrees off ours: the upper arm
-    /// turns as much about itself as keeps the forearm's direction, by a few Gauss-Newton steps. Returns the forearm.
+    /// The upper arm's three angles and the elbow's, four for the directions of two segments: elbow and wrist come where ours are,
+    /// by a few Gauss-Newton steps. The model's elbow bends about an axis 13 degrees off ours, so the upper arm turns about
+    /// itself; its own turn decides where the arm is straight. Returns the forearm.
     fn arm(
         &mut self,
         trunk: &UnitQuaternion<f64>,
@@ -170,7 +171,7 @@ impl Found<'_> {
         lower: &UnitQuaternion<f64>,
         mirror: f64,
     ) -> UnitQuaternion<f64> {
-        /// Weight of the upper arm's own rotation against the forearm's direction.
+        /// Weight of the upper arm's own rotation against the directions.
         const OWN: f64 = 0.05;
         const STEPS: usize = 10;
         let at = self.values.len();
@@ -178,16 +179,17 @@ impl Found<'_> {
         self.hinges(upper, lower, &[mirrored(ELBOW, mirror)]);
         let axes = [mirrored(Z, mirror), mirrored(X, mirror), mirrored(Y, mirror), mirrored(ELBOW, mirror)];
         let mut angles = Vector4::from_iterator(self.values.drain(at..));
-        let residual = |angles: &Vector4<f64>| -> Vector6<f64> {
+        let residual = |angles: &Vector4<f64>| -> SVector<f64, 9> {
             let turned = trunk * product(&axes[..3], &angles.as_slice()[..3]);
             let own = log(&(turned.inverse() * upper)) * OWN;
-            let along = lower * Vector3::y() - turned * exp(&(axes[3] * angles[3])) * Vector3::y();
-            Vector6::new(own.x, own.y, own.z, along.x, along.y, along.z)
+            let along_upper = upper * Vector3::y() - turned * Vector3::y();
+            let along_lower = lower * Vector3::y() - turned * exp(&(axes[3] * angles[3])) * Vector3::y();
+            SVector::from_iterator([own, along_upper, along_lower].iter().flat_map(|v| v.iter().copied()))
         };
         for _ in 0..STEPS {
             const H: f64 = 1e-5;
             let slope = |k: usize| (residual(&(angles + Vector4::ith(k, H))) - residual(&(angles - Vector4::ith(k, H)))) / (2.0 * H);
-            let jacobian = Matrix6x4::from_columns(&[slope(0), slope(1), slope(2), slope(3)]);
+            let jacobian = SMatrix::<f64, 9, 4>::from_columns(&[slope(0), slope(1), slope(2), slope(3)]);
             let normal = jacobian.transpose() * jacobian + Matrix4::identity() * 1e-9;
             let Some(step) = normal.cholesky().map(|c| c.solve(&(jacobian.transpose() * -residual(&angles)))) else { break };
             angles += step.map(|s| s.clamp(-0.5, 0.5));
@@ -316,11 +318,14 @@ pub(in crate::io) mod tests {
             println!("{}: {found:.5} degrees", joint.name());
             assert!(found < most_deg, "{}: {found} degrees", joint.name());
         }
-        let forearm = |clip: &Clip, pose: &Pose| clip.place(pose).world_from_node[LElbow as usize] * Vector3::y();
-        let off =
-            clip.poses.iter().zip(&back.poses).map(|(p, q)| forearm(&clip, p).angle(&forearm(&back, q)).to_degrees()).fold(0.0, f64::max);
-        println!("direction of the left forearm: {off:.3} degrees");
-        assert!(off < 0.5, "{off}");
+        for joint in [LShoulder, RShoulder, LElbow, RElbow, LAnkle, RAnkle] {
+            let down = if matches!(joint, LAnkle | RAnkle) { Vector3::z() } else { -Vector3::y() };
+            let along = |clip: &Clip, pose: &Pose| clip.place(pose).world_from_node[joint as usize] * down;
+            let off =
+                clip.poses.iter().zip(&back.poses).map(|(p, q)| along(&clip, p).angle(&along(&back, q)).to_degrees()).fold(0.0, f64::max);
+            println!("direction of the segment below {}: {off:.3} degrees", joint.name());
+            assert!(off < if down.z > 0.0 { 4.0 } else { 0.5 }, "{}: {off} degrees", joint.name());
+        }
         let pelvis = |clip: &Clip, pose: &Pose| clip.place(pose).position(Root);
         let off = clip.poses.iter().zip(&back.poses).map(|(p, q)| (pelvis(&clip, p) - pelvis(&back, q)).norm()).fold(0.0, f64::max);
         println!("root: {:.2} mm, stature {:.3} of {:.3}", 1e3 * off, back.hip_height_m, clip.hip_height_m);
