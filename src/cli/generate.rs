@@ -266,8 +266,9 @@ fn planted(args: &GenerateArgs, name: &str, clip: Clip) -> Clip {
     }
     let planted = plant_feet(&clip);
     println!("{name}: {} contacts of feet planted", planted.contacts.iter().map(Vec::len).sum::<usize>());
-    if planted.sliding > 0 {
-        eprintln!("notice: {name}: in {} contacts the foot still slides by more than 5 mm", planted.sliding);
+    if planted.sliding() > 0 {
+        let (count, farthest_mm) = (planted.sliding(), 1e3 * planted.farthest_m());
+        eprintln!("notice: {name}: in {count} contacts the foot still slides by more than 5 mm, at most {farthest_mm:.0} mm");
     }
     planted.clip
 }

@@ -30,8 +30,20 @@ pub struct Planted {
     pub clip: Clip,
     /// Frames in which the left and the right foot stand.
     pub contacts: [Vec<Range<usize>>; 2],
-    /// Contacts whose foot still drifts by more than 5 mm ([`FootTrack::drift_m`]).
-    pub sliding: usize,
+    /// How far the foot still drifts in each contact, metres ([`FootTrack::drift_m`]).
+    pub drifts_m: [Vec<f64>; 2],
+}
+
+impl Planted {
+    /// Contacts whose foot still drifts by more than 5 mm.
+    pub fn sliding(&self) -> usize {
+        self.drifts_m.iter().flatten().filter(|d| **d > STILL_M).count()
+    }
+
+    /// The largest drift, metres.
+    pub fn farthest_m(&self) -> f64 {
+        self.drifts_m.iter().flatten().copied().fold(0.0, f64::max)
+    }
 }
 
 /// Plants the feet of a clip whose floor is y = 0.
@@ -45,10 +57,9 @@ pub fn plant_feet(clip: &Clip) -> Planted {
     }
     let poses = changes.iter().enumerate().map(|(frame, x)| footing.pose(frame, x)).collect();
     let planted = Clip { poses, ..clip.clone() };
-    let slides = |side: usize| {
+    let drifts_m = [0, 1].map(|side: usize| {
         let foot = FootTrack::new(&planted, LEGS[side][2]);
-        contacts[side].iter().filter(|c| foot.drift_m((*c).clone()) > STILL_M).count()
-    };
-    let sliding = slides(0) + slides(1);
-    Planted { clip: planted, contacts, sliding }
+        contacts[side].iter().map(|c| foot.drift_m(c.clone())).collect()
+    });
+    Planted { clip: planted, contacts, drifts_m }
 }

@@ -86,12 +86,13 @@ impl GeneratedReport<'_> {
                 nearest,
                 format!("{:.3}", s.parameter),
                 format!("{:.3}", s.frequency_hz),
+                s.angle_sd().map_or("\u{2013}".into(), |sd| format!("{:.2}", sd.to_degrees())),
                 m.clip.poses.len().to_string(),
             ]
         };
         let rows: Vec<Vec<String>> = self.made.iter().map(row).collect();
         let parameter = format!("{} ({})", if self.model.activity.is_cyclic() { "speed" } else { "length" }, self.unit());
-        table(&["file", "subject that counts most", &parameter, "cycles/s", "frames"], &rows, 2)
+        table(&["file", "subject that counts most", &parameter, "cycles/s", "angles' standard deviation (deg)", "frames"], &rows, 2)
     }
 
     fn figures(&self) -> Result<image::RgbImage, ReportError> {

@@ -4,7 +4,8 @@
 //! [`SAME_PARAMETER`] make one knot; between knots runs a natural cubic spline. Splines are linear in their values: on a full
 //! grid of parameters the weighted sum of subjects' splines is the paper's spline of the weighted sums.
 //! A subject takes part at s inside the recorded range and [`JUST_BEYOND`] it. Farther out a subject keeps its own end and
-//! follows the population's change, the regression of α on s in which every subject counts once.
+//! follows the population's change, the regression of α on s within subjects, each of which counts once: between subjects the
+//! same line would take for a change what is a difference of people who were recorded at other speeds.
 //! Checked against the grid case of the paper and a population with a known slope.
 
 use nalgebra::DVector;
@@ -98,21 +99,26 @@ impl Population {
         let count = count.clamp(1, model.basis.ncols());
         let basis = model.basis.columns(0, count);
         let mut curves = Vec::new();
-        let mut points: Vec<(f64, f64, DVector<f64>)> = Vec::new();
         for subject in model.subjects() {
             let knots = knots(model.members.iter().filter(|m| m.subject == subject));
             let weights: Vec<DVector<f64>> = knots.iter().map(|k| basis.tr_mul(&(mean_vector(k) - &model.mean))).collect();
             let parameters: Vec<f64> = knots.iter().map(|k| k.parameter).collect();
-            let share = 1.0 / knots.len() as f64;
-            points.extend(parameters.iter().zip(&weights).map(|(s, w)| (share, *s, w.clone())));
             if let Some(spline) = Spline::natural(parameters, weights) {
                 curves.push(Curve { subject: subject.to_string(), spline });
             }
         }
-        let (eigenvalues, slope) = (model.eigenvalues[..count].to_vec(), slope(&points, count));
+        let (eigenvalues, slope) = (model.eigenvalues[..count].to_vec(), change(&curves, count));
         let mut population = Population { curves, eigenvalues, slope, lasting: Lasting::default() };
         population.lasting = Lasting::of(&population);
         population
+    }
+
+    /// All but subject `p`, without how deviations last.
+    pub(super) fn without(&self, p: usize) -> Population {
+        let mut curves = self.curves.clone();
+        curves.remove(p);
+        let slope = change(&curves, self.components());
+        Population { curves, slope, eigenvalues: self.eigenvalues.clone(), lasting: Lasting::default() }
     }
 
     /// Smallest and largest parameter of the recordings.
@@ -181,6 +187,21 @@ pub fn mean_vector(knot: &Knot) -> DVector<f64> {
 /// Mean root channels of a knot's cycles.
 pub fn mean_root(knot: &Knot) -> DVector<f64> {
     knot.members.iter().map(|m| &m.root).sum::<DVector<f64>>() / knot.members.len() as f64
+}
+
+/// Change of the weights per unit of the parameter within subjects; where nobody was recorded at two parameters, between them.
+fn change(curves: &[Curve], count: usize) -> DVector<f64> {
+    let within = curves.iter().any(|c| c.parameters().len() > 1);
+    let points = curves.iter().flat_map(|c| {
+        let share = 1.0 / c.parameters().len() as f64;
+        let own: Vec<(f64, DVector<f64>)> = c.parameters().iter().map(|&s| (s, c.at(s))).collect();
+        let mut mean = (0.0, DVector::zeros(count));
+        if within {
+            own.iter().for_each(|(s, w)| mean = (mean.0 + share * s, &mean.1 + w * share));
+        }
+        own.into_iter().map(move |(s, w)| (share, s - mean.0, w - &mean.1)).collect::<Vec<_>>()
+    });
+    slope(&points.collect::<Vec<_>>(), count)
 }
 
 /// Least-squares slope of weighted points (share, parameter, weights); zero where the parameter does not vary.

@@ -123,6 +123,22 @@ mod tests {
     }
 
     #[test]
+    fn the_populations_change_is_peoples_own() {
+        // Whoever was recorded at higher speeds stands lower: between people the line falls, within them it rises.
+        let subjects: [(&str, f64, &[f64]); 3] = [("a", 6.0, &[0.8, 1.1]), ("b", 3.0, &[1.1, 1.4, 1.5]), ("c", 0.0, &[1.4])];
+        let change = |subjects: &[(&str, f64, &[f64])]| {
+            let model = model(subjects, |s| (2.0 * s, -20.0 * s));
+            let population = Population::new(&model, model.basis.ncols());
+            let moved = &model.basis.columns(0, population.components()) * &population.slope;
+            (moved[0], moved[7])
+        };
+        let (first, second) = change(&subjects);
+        assert!((first - 2.0).abs() < 1e-9 && (second + 20.0).abs() < 1e-9, "{first} {second}");
+        let alone: [(&str, f64, &[f64]); 3] = [("a", 6.0, &[0.8]), ("b", 3.0, &[1.1]), ("c", 0.0, &[1.4])];
+        assert!((change(&alone).0 + 8.0).abs() < 1e-9, "{:?}", change(&alone));
+    }
+
+    #[test]
     fn a_database_subject_comes_back_exactly() {
         let model = model(&[("a", 0.0, &GRID), ("b", 1.0, &GRID)], |s| (s, s * s));
         let population = Population::new(&model, 2);

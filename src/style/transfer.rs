@@ -6,7 +6,9 @@
 //! the best linear prediction is
 //!   α̃(s2) = m(s2) + Σ_k c_k (α_k − m(s_k)),   c = K⁻¹ k                                                           (2)
 //! which for one observation is the own motion plus the weighted change, the deviation scaled by g = e^{βδ−κ|δ|}, δ = s2−s1.
-//! What the weights do not hold of a recorded motion ([`Detail`]) is part of the deviation. β (faster people differ more) and
+//! What the weights do not hold of a recorded motion ([`Detail`]) is part of the deviation. Everybody in the database takes part
+//! at every parameter, carried beyond the own recordings by the population's change: the few who were recorded at both make a
+//! poorer mean, and one that jumps where somebody's recordings end. β (faster people differ more) and
 //! κ (nobody's change is quite everybody's) are those that best predict every database subject from the others, [`Lasting`].
 //!
 //! Variance of weight i: Σ_k c_k² var(α_k,i) + v_i h + b² u_i. h is the part of the deviation's variance that the observations
@@ -97,33 +99,29 @@ impl Lasting {
 
 /// All ordered pairs of subject `p`'s parameters with its deviations from the others.
 fn pairs(population: &Population, p: usize) -> Vec<Pair> {
-    let own = &population.curves[p];
-    let others: Vec<&Curve> = population.curves.iter().enumerate().filter(|(q, _)| *q != p).map(|(_, c)| c).collect();
-    let parameters = own.parameters();
+    let (own, others) = (&population.curves[p], population.without(p));
     let mut found = Vec::new();
-    for &s1 in parameters {
-        for &s2 in parameters.iter().filter(|&&s2| s2 != s1) {
+    if others.curves.iter().filter(|c| c.parameters().len() > 1).count() < 2 {
+        return found;
+    }
+    for &s1 in own.parameters() {
+        for &s2 in own.parameters().iter().filter(|&&s2| s2 != s1) {
             let (a1, a2) = (own.at(s1), own.at(s2));
-            let Some(like) = like(population, &others, &[(s1, a1.clone())], s2) else { continue };
-            found.push(Pair { s1, s2, d1: a1 - mean(population, &like, s1), d2: a2 - mean(population, &like, s2) });
+            let like = like(&others, &[(s1, a1.clone())]);
+            found.push(Pair { s1, s2, d1: a1 - mean(&others, &like, s1), d2: a2 - mean(&others, &like, s2) });
         }
     }
     found
 }
 
-/// Weights (7) over the subjects recorded at all the parameters; `None` with fewer than two of them.
-fn like<'a>(population: &Population, subjects: &[&'a Curve], observed: &[(f64, DVector<f64>)], s2: f64) -> Option<Vec<(&'a Curve, f64)>> {
-    let there = shared_subjects(subjects, observed.iter().map(|o| o.0).chain([s2]))?;
-    Some(weighted(population, &there, observed))
-}
-
-fn weighted<'a>(population: &Population, subjects: &[&'a Curve], observed: &[(f64, DVector<f64>)]) -> Vec<(&'a Curve, f64)> {
-    let distance = |c: &&Curve| {
+/// Everybody with the weights (7).
+fn like<'a>(population: &'a Population, observed: &[(f64, DVector<f64>)]) -> Vec<(&'a Curve, f64)> {
+    let distance = |c: &Curve| {
         let to = |(s, a): &(f64, DVector<f64>)| Metric::Paper.distance(&population.eigenvalues, a, &population.extended(c, *s));
         observed.iter().map(to).sum::<f64>() / observed.len() as f64
     };
-    let shares = inverse_distance_weights(&subjects.iter().map(distance).collect::<Vec<_>>());
-    subjects.iter().copied().zip(shares).collect()
+    let shares = inverse_distance_weights(&population.curves.iter().map(distance).collect::<Vec<_>>());
+    population.curves.iter().zip(shares).collect()
 }
 
 fn mean(population: &Population, like: &[(&Curve, f64)], parameter: f64) -> DVector<f64> {
@@ -178,10 +176,8 @@ pub fn transfer(population: &Population, observations: &[Observation], s2: f64) 
     let observed: Vec<(f64, DVector<f64>)> =
         observations.iter().map(|o| (o.parameter, DVector::from_column_slice(&o.weights[..count]))).collect();
     let parameters: Vec<f64> = observed.iter().map(|o| o.0).collect();
-    let all: Vec<&Curve> = population.curves.iter().collect();
-    let shared = like(population, &all, &observed, s2);
-    let notice = notice(population, shared.is_none(), &parameters, s2);
-    let like = shared.unwrap_or_else(|| weighted(population, &all, &observed));
+    let notice = notice(population, &parameters, s2);
+    let like = like(population, &observed);
     let lasting = &population.lasting;
     let (c, open) = lasting.prediction(&parameters, s2);
     let mut weights = mean(population, &like, s2);
@@ -199,7 +195,7 @@ pub fn transfer(population: &Population, observations: &[Observation], s2: f64) 
     Ok(Extrapolation { weights, detail, sd: Some(sd), shares, notice })
 }
 
-fn notice(population: &Population, sparse: bool, observed: &[f64], s2: f64) -> Option<String> {
+fn notice(population: &Population, observed: &[f64], s2: f64) -> Option<String> {
     let list: Vec<String> = observed.iter().map(|s| format!("{s:.2}")).collect();
     let (lo, hi) = population.range();
     if population.beyond(s2) > 0.0 {
@@ -207,16 +203,16 @@ fn notice(population: &Population, sparse: bool, observed: &[f64], s2: f64) -> O
             "nobody in the database was recorded at {s2:.2} ({lo:.2} to {hi:.2} were): the change goes on as a straight line, less certain the farther"
         ));
     }
-    if sparse {
+    let all: Vec<&Curve> = population.curves.iter().collect();
+    if shared_subjects(&all, observed.iter().copied().chain([s2])).is_none() {
         return Some(format!(
-            "fewer than two database subjects were recorded both at {} and at {s2:.2}: all {} take part, carried beyond their \
-             recordings by the population's mean change",
-            list.join(", "),
-            population.curves.len()
+            "fewer than two database subjects were recorded both at {} and at {s2:.2}: the others are carried there by the \
+             population's mean change",
+            list.join(", ")
         ));
     }
     (population.lasting.pairs == 0)
-        .then(|| "no three database subjects were recorded at two common parameters: the own deviation is kept whole".to_string())
+        .then(|| "no three database subjects were recorded at two parameters each: the own deviation is kept whole".to_string())
 }
 
 #[cfg(test)]
