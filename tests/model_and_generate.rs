@@ -112,4 +112,11 @@ fn the_papers_ordering_emerges_from_the_synthetic_runners() {
     let [intra, paper, inter] = ["intra", "paper", "inter"].map(|m| value(&format!("{m},eq6,all,")));
     assert!(intra < paper && paper < 0.6 * inter, "{intra} {paper} {inter}");
     assert!(value("paper,rms_deg,all,") < value("mean,rms_deg,all,"));
+    // Every ordered pair of parameters has a line, and together they are what the table pools.
+    let pairs = std::fs::read_to_string(dir.path().join("v/pairs.csv")).unwrap();
+    let rows: Vec<Vec<&str>> = pairs.lines().skip(1).map(|l| l.split(',').collect()).collect();
+    let deg: Vec<f64> = rows.iter().filter(|r| r[3] == "default").map(|r| r[4].parse().unwrap()).collect();
+    assert!(deg.len() > 50 && rows.iter().all(|r| r[1] != r[2]), "{pairs}");
+    let pooled = (deg.iter().map(|d| d * d).sum::<f64>() / deg.len() as f64).sqrt();
+    assert!((pooled / value("default,rms_deg,all,") - 1.0).abs() < 1e-5, "{pooled}");
 }

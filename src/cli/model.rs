@@ -10,7 +10,7 @@ use muybridge::io::write_atomic;
 use muybridge::motion_model::{Activity, Model, database, synthetic};
 use muybridge::report;
 use muybridge::report::validation::ValidationReport;
-use muybridge::style::validate::{METRICS, Score, validate};
+use muybridge::style::validate::{METRICS, PairScore, Score, validate};
 
 use super::motions::{ActivityName, TABLE, exclude, file_name, read_recordings};
 
@@ -98,7 +98,7 @@ pub struct SyntheticArgs {
 pub struct ValidateArgs {
     /// Model file (.npz)
     model: PathBuf,
-    /// Folder for validation.csv, degrees.csv (every angle) and two pictures
+    /// Folder for validation.csv, degrees.csv (every angle), pairs.csv (every pair of parameters) and two pictures
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Part of the variance that the components in use hold; 0.90 for walking, else 0.95
@@ -250,11 +250,17 @@ fn run_validation(args: ValidateArgs) -> Result<()> {
         let line = |s: &Score| format!("{},{},{},{:.6}\n", s.method, s.metric, s.left_out.replace(',', ";"), s.value);
         format!("{head}\n{}", scores.iter().map(line).collect::<String>())
     };
+    let pair = |p: &PairScore| {
+        let who = p.left_out.replace(',', ";");
+        format!("{who},{:.3},{:.3},{},{:.6},{:.6}\n", p.from, p.to, p.method, p.rms_deg, p.rms_mm)
+    };
+    let pairs = format!("left_out,from,to,method,rms_deg,rms_mm\n{}", validation.pairs.iter().map(pair).collect::<String>());
     let (name, hash) = (file_name(&args.model), model_hash(&model));
     let page = ValidationReport { model: &model, name: &name, hash: &hash, variance, validation: &validation }.html();
     for (name, text) in [
         ("validation.csv", table_of("method,metric,left_out,value", &validation.scores)),
         ("degrees.csv", table_of("method,angle,left_out,rms_deg", &validation.angles)),
+        ("pairs.csv", pairs),
         ("report.html", page),
     ] {
         let path = args.output.join(name);

@@ -46,5 +46,6 @@ pub mod video;
 
 pub use atomic::{with_remedy, write_atomic};
 pub use mocap::{MocapError, ReadClip, is_motion_file, read_clip};
+pub use npz::ArchiveError;
 pub use opencv_yml::write_opencv_rig;
 pub use rig_files::{ReadRig, RigFileError, RigReading, read_rig_files};

@@ -15,36 +15,26 @@
 //! BLAKE3 hash covers all arrays and the rest of the header. Checked against numpy's own reading in development.
 
 use std::fs::File;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use super::npz::{self, Array, Fault};
-use super::write_atomic;
+use super::npz::{self, ArchiveError, Array, Fault};
 use crate::body::{BALL_JOINTS, DOF};
 use crate::motion_model::{Activity, Member, Model, ROOT_CHANNELS, SAMPLES};
 
-const FORMAT: &str = "muybridge-model";
-const VERSION: u32 = 1;
 const VECTOR: usize = SAMPLES * DOF;
 const ROOT: usize = SAMPLES * ROOT_CHANNELS;
 
-#[derive(Debug, thiserror::Error)]
-pub enum ModelFileError {
-    #[error("cannot read {path}: {cause}")]
-    Read { path: PathBuf, cause: std::io::Error },
-    #[error("cannot write {path}: {cause}")]
-    Write { path: PathBuf, cause: std::io::Error },
-    #[error("{path} is no model file of muybridge ({why}); `muybridge model build` makes one")]
-    Foreign { path: PathBuf, why: String },
-    #[error("{path} is a model of version {found}, this program reads {VERSION}; build it again")]
-    Version { path: PathBuf, found: u32 },
-    #[error("{path} is a model of another skeleton ({found}), {} is needed; build it again from the recordings", npz::SKELETON)]
-    Skeleton { path: PathBuf, found: String },
-    #[error("{path} is damaged: {why}; build or copy it again")]
-    Damaged { path: PathBuf, why: String },
-}
+const KIND: npz::Kind = npz::Kind {
+    format: "muybridge-model",
+    version: 1,
+    short: "model",
+    whole: "model file of muybridge",
+    command: "muybridge model build",
+    sources: "recordings",
+};
 
 #[derive(Serialize, Deserialize)]
 struct Header {
@@ -66,8 +56,8 @@ struct Header {
 impl Header {
     fn of(model: &Model) -> Header {
         Header {
-            format: FORMAT.into(),
-            version: VERSION,
+            format: KIND.format.into(),
+            version: KIND.version,
             skeleton: npz::SKELETON.into(),
             joints: npz::joint_names(),
             samples: SAMPLES,
@@ -110,10 +100,8 @@ pub fn model_hash(model: &Model) -> String {
 }
 
 /// Writes a model; the same model gives the same bytes.
-pub fn write_model(path: &Path, model: &Model) -> Result<(), ModelFileError> {
-    let failed = |cause| ModelFileError::Write { path: path.to_path_buf(), cause };
-    let bytes = encode(model).map_err(failed)?;
-    write_atomic(path, &bytes).map_err(failed)
+pub fn write_model(path: &Path, model: &Model) -> Result<(), ArchiveError> {
+    npz::write(path, encode(model))
 }
 
 fn encode(model: &Model) -> std::io::Result<Vec<u8>> {
@@ -124,20 +112,13 @@ fn encode(model: &Model) -> std::io::Result<Vec<u8>> {
 }
 
 /// Reads a model and checks kind, version, skeleton, shapes and hash.
-pub fn read_model(path: &Path) -> Result<Model, ModelFileError> {
-    let own = |path: &Path| path.to_path_buf();
-    let file = File::open(path).map_err(|cause| ModelFileError::Read { path: own(path), cause })?;
-    model_of(file).map_err(|fault| match fault {
-        Fault::Foreign(why) => ModelFileError::Foreign { path: own(path), why },
-        Fault::Version(found) => ModelFileError::Version { path: own(path), found },
-        Fault::Skeleton(found) => ModelFileError::Skeleton { path: own(path), found },
-        Fault::Damaged(why) => ModelFileError::Damaged { path: own(path), why },
-    })
+pub fn read_model(path: &Path) -> Result<Model, ArchiveError> {
+    npz::read(path, &KIND, model_of)
 }
 
 fn model_of(file: File) -> Result<Model, Fault> {
     let mut npz = npz::Reader::new(file)?;
-    let header: Header = npz.header(FORMAT, VERSION)?;
+    let header: Header = npz.header(&KIND)?;
     if header.samples != SAMPLES {
         return Err(Fault::Skeleton(format!("{} samples in place of {SAMPLES}", header.samples)));
     }

@@ -1,6 +1,8 @@
 //! What model and space files have in common: `.npz` archives of `f64` arrays with a JSON header, hashed, checked.
 
+use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
 
 use nalgebra::{Quaternion, UnitQuaternion};
 use npyz::npz::NpzWriter;
@@ -10,6 +12,7 @@ use serde::de::DeserializeOwned;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
+use super::write_atomic;
 use crate::body::{BALL_JOINTS, Joint};
 
 /// Bytes that one of the archive may unpack to, besides the first million: numpy's compressed zeros take a thousandth, nobody's
@@ -20,12 +23,62 @@ const LONGEST_DESCRIPTION: usize = 1024;
 
 pub const SKELETON: &str = "muybridge-hanim-78";
 
-/// What is wrong with an archive; the callers add the path and the remedy.
+/// A kind of archive: its format and version, and the words that errors need.
+#[derive(Debug)]
+pub struct Kind {
+    pub format: &'static str,
+    pub version: u32,
+    /// "model", and "model file of muybridge" or the like.
+    pub short: &'static str,
+    pub whole: &'static str,
+    /// What makes one, and of what.
+    pub command: &'static str,
+    pub sources: &'static str,
+}
+
+/// What is wrong with an archive.
+#[derive(Debug)]
 pub enum Fault {
     Foreign(String),
     Version(u32),
     Skeleton(String),
     Damaged(String),
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum ArchiveError {
+    #[error("cannot read {path}: {cause}")]
+    Read { path: PathBuf, cause: std::io::Error },
+    #[error("cannot write {path}: {cause}")]
+    Write { path: PathBuf, cause: std::io::Error },
+    #[error("{path} {}", fault.words(kind))]
+    Content { path: PathBuf, kind: &'static Kind, fault: Fault },
+}
+
+impl Fault {
+    /// What is wrong and what to do, after the file's name.
+    fn words(&self, kind: &Kind) -> String {
+        let Kind { version, short, whole, command, sources, .. } = kind;
+        match self {
+            Fault::Foreign(why) => format!("is no {whole} ({why}); `{command}` makes one"),
+            Fault::Version(found) => format!("is a {short} of version {found}, this program reads {version}; build it again"),
+            Fault::Skeleton(found) => {
+                format!("is a {short} of another skeleton ({found}), {SKELETON} is needed; build it again from the {sources}")
+            }
+            Fault::Damaged(why) => format!("is damaged: {why}; build or copy it again"),
+        }
+    }
+}
+
+/// Opens and decodes a file of a kind.
+pub fn read<T>(path: &Path, kind: &'static Kind, decode: impl FnOnce(File) -> Result<T, Fault>) -> Result<T, ArchiveError> {
+    let file = File::open(path).map_err(|cause| ArchiveError::Read { path: path.into(), cause })?;
+    decode(file).map_err(|fault| ArchiveError::Content { path: path.into(), kind, fault })
+}
+
+/// Writes a file, whole or not at all.
+pub fn write(path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), ArchiveError> {
+    bytes.and_then(|bytes| write_atomic(path, &bytes)).map_err(|cause| ArchiveError::Write { path: path.into(), cause })
 }
 
 /// An array of the file: name, shape, values in C order.
@@ -104,16 +157,16 @@ impl<R: Read + Seek> Reader<R> {
         Ok(Some(bytes))
     }
 
-    /// The header of this format, version and skeleton.
-    pub fn header<H: DeserializeOwned>(&mut self, format: &str, version: u32) -> Result<H, Fault> {
+    /// The header of this kind and skeleton.
+    pub fn header<H: DeserializeOwned>(&mut self, kind: &Kind) -> Result<H, Fault> {
         let entry = self.entry("header").and_then(|entry| entry.ok_or("it holds no array `header`".into()));
         let bytes = entry.and_then(|entry| numbers::<u8>(&entry)).map_err(Fault::Foreign)?.1;
         let value: serde_json::Value = serde_json::from_slice(&bytes).map_err(|_| Fault::Foreign("its header is no JSON".into()))?;
-        if value["format"] != format {
+        if value["format"] != kind.format {
             return Err(Fault::Foreign("its header names another format".into()));
         }
         let found = value["version"].as_u64().unwrap_or(0) as u32;
-        if found != version {
+        if found != kind.version {
             return Err(Fault::Version(found));
         }
         let found = value["skeleton"].as_str().unwrap_or("unnamed").to_string();

@@ -12,36 +12,25 @@
 //!
 //! A space has one file only, byte for byte; the header's hash covers everything.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use super::npz::{self, Array, Fault};
-use super::write_atomic;
+use super::npz::{self, ArchiveError, Array, Fault};
 use crate::body::BALL_JOINTS;
 use crate::math::pca::Pca;
 use crate::motion_model::Activity;
 use crate::style::space::{Attribute, Layout, Member, Space, Vectors};
 
-const FORMAT: &str = "muybridge-space";
-const VERSION: u32 = 1;
-
-#[derive(Debug, thiserror::Error)]
-pub enum SpaceFileError {
-    #[error("cannot read {path}: {cause}")]
-    Read { path: PathBuf, cause: std::io::Error },
-    #[error("cannot write {path}: {cause}")]
-    Write { path: PathBuf, cause: std::io::Error },
-    #[error("{path} is no space of motions ({why}); `muybridge blend build` makes one")]
-    Foreign { path: PathBuf, why: String },
-    #[error("{path} is a space of version {found}, this program reads {VERSION}; build it again")]
-    Version { path: PathBuf, found: u32 },
-    #[error("{path} is of another skeleton ({found}), {} is needed; build it again from the motions", npz::SKELETON)]
-    Skeleton { path: PathBuf, found: String },
-    #[error("{path} is damaged: {why}; build or copy it again")]
-    Damaged { path: PathBuf, why: String },
-}
+const KIND: npz::Kind = npz::Kind {
+    format: "muybridge-space",
+    version: 1,
+    short: "space",
+    whole: "space of motions",
+    command: "muybridge blend build",
+    sources: "motions",
+};
 
 #[derive(Serialize, Deserialize)]
 struct Header {
@@ -65,8 +54,8 @@ struct Header {
 impl Header {
     fn of(space: &Space) -> Header {
         Header {
-            format: FORMAT.into(),
-            version: VERSION,
+            format: KIND.format.into(),
+            version: KIND.version,
             skeleton: npz::SKELETON.into(),
             joints: npz::joint_names(),
             activity: space.activity,
@@ -113,30 +102,21 @@ fn arrays(space: &Space) -> Vec<Array> {
 }
 
 /// Writes a space; the same space gives the same bytes.
-pub fn write_space(path: &Path, space: &Space) -> Result<(), SpaceFileError> {
-    let failed = |cause| SpaceFileError::Write { path: path.to_path_buf(), cause };
+pub fn write_space(path: &Path, space: &Space) -> Result<(), ArchiveError> {
     let arrays = arrays(space);
     let mut header = Header::of(space);
     header.blake3 = npz::hash(&header, &arrays);
-    let bytes = npz::archive(&header, arrays).map_err(failed)?;
-    write_atomic(path, &bytes).map_err(failed)
+    npz::write(path, npz::archive(&header, arrays))
 }
 
 /// Reads a space and checks kind, version, skeleton, shapes and hash.
-pub fn read_space(path: &Path) -> Result<Space, SpaceFileError> {
-    let own = |path: &Path| path.to_path_buf();
-    let file = std::fs::File::open(path).map_err(|cause| SpaceFileError::Read { path: own(path), cause })?;
-    space_of(file).map_err(|fault| match fault {
-        Fault::Foreign(why) => SpaceFileError::Foreign { path: own(path), why },
-        Fault::Version(found) => SpaceFileError::Version { path: own(path), found },
-        Fault::Skeleton(found) => SpaceFileError::Skeleton { path: own(path), found },
-        Fault::Damaged(why) => SpaceFileError::Damaged { path: own(path), why },
-    })
+pub fn read_space(path: &Path) -> Result<Space, ArchiveError> {
+    npz::read(path, &KIND, space_of)
 }
 
 fn space_of(file: std::fs::File) -> Result<Space, Fault> {
     let mut npz = npz::Reader::new(file)?;
-    let header: Header = npz.header(FORMAT, VERSION)?;
+    let header: Header = npz.header(&KIND)?;
     let layout = Layout { intervals: header.intervals, cyclic: header.cyclic, per_curve: header.timing_per_curve };
     if !(2..1_000_000).contains(&layout.intervals) {
         return Err(Fault::Damaged(format!("its header: {} intervals", layout.intervals)));

@@ -162,7 +162,7 @@ impl ValidationReport<'_> {
                 ("cases", format!("{}, in {} of them too few other subjects were recorded at both ends", v.cases, v.sparse_cases)),
                 ("version", concat!("muybridge ", env!("CARGO_PKG_VERSION")).to_string()),
             ]))
-            p.small.soft { "Numbers beside this page: validation.csv, of every angle degrees.csv." }
+            p.small.soft { "Numbers beside this page: validation.csv, of every angle degrees.csv, of every pair of parameters pairs.csv." }
         }
     }
 }

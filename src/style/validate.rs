@@ -52,12 +52,26 @@ pub struct Score {
     pub value: f64,
 }
 
+/// One line of `pairs.csv`: a left-out subject's motion at one parameter carried to another.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PairScore {
+    pub left_out: String,
+    /// m/s or m.
+    pub from: f64,
+    pub to: f64,
+    pub method: &'static str,
+    pub rms_deg: f64,
+    pub rms_mm: f64,
+}
+
 /// What the validation found.
 #[derive(Clone, Debug)]
 pub struct Validation {
     pub scores: Vec<Score>,
     /// Degrees of every angle.
     pub angles: Vec<Score>,
+    /// Every ordered pair of parameters.
+    pub pairs: Vec<PairScore>,
     pub cases: usize,
     /// Cases in which too few other subjects were recorded at both ends.
     pub sparse_cases: usize,
@@ -81,6 +95,7 @@ struct Sums {
 /// Sums of one left-out subject.
 struct LeftOut {
     methods: Vec<Sums>,
+    pairs: Vec<PairScore>,
     cases: usize,
     sparse_cases: usize,
     /// Squared error over variance, of the default's weights.
@@ -119,6 +134,7 @@ pub fn validate(model: &Model, variance: f64) -> Result<Validation, ModelError> 
     Ok(Validation {
         scores,
         angles: by_angle,
+        pairs: found.iter().flat_map(|f| f.pairs.clone()).collect(),
         cases: found.iter().map(|f| f.cases).sum(),
         sparse_cases: found.iter().map(|f| f.sparse_cases).sum(),
         sd_ratio: (spread.0 / spread.1).sqrt(),
@@ -176,7 +192,7 @@ fn leave_out(model: &Model, angles: &Angles, subject: &str, variance: f64) -> Re
         offsets: Shape::template(stature).offsets(),
     };
     let sums = Sums { angles: vec![(0.0, 0.0); angles.names().len()], ..Sums::default() };
-    let mut found = LeftOut { methods: vec![sums; METHODS.len()], cases: 0, sparse_cases: 0, spread: (0.0, 0.0) };
+    let mut found = LeftOut { methods: vec![sums; METHODS.len()], pairs: Vec::new(), cases: 0, sparse_cases: 0, spread: (0.0, 0.0) };
     let own_knots = knots(&own);
     bench.interpolation(&own_knots, &mut found);
     bench.variability(&own, &own_knots, &mut found);
@@ -192,7 +208,9 @@ impl Bench<'_> {
             for (from, observed) in own.iter().zip(&seen).filter(|(k, _)| k.parameter != to.parameter) {
                 let Ok(motions) = self.carried(observed, from.parameter, to.parameter, target, found) else { continue };
                 for (row, (weights, detail)) in motions {
-                    found.methods[row as usize].add(self, &self.shown(&weights, detail.as_ref()), target);
+                    let shown = self.shown(&weights, detail.as_ref());
+                    found.methods[row as usize].add(self, &shown, target);
+                    found.pairs.push(self.pair(from, to, METHODS[row as usize], &shown, target));
                 }
             }
             let rest: Vec<Observation> = seen.iter().filter(|o| o.parameter != to.parameter).cloned().collect();
@@ -202,6 +220,20 @@ impl Bench<'_> {
                 let shown = self.shown(&several.weights, several.detail.as_ref());
                 found.methods[Row::Several as usize].add(self, &shown, target);
             }
+        }
+    }
+
+    fn pair(&self, from: &Knot, to: &Knot, method: &'static str, found: &Shown, target: &Shown) -> PairScore {
+        let mut sums = Sums { angles: vec![(0.0, 0.0); self.angles.names().len()], ..Sums::default() };
+        sums.add_shapes(found, target);
+        let rms = |(sum, count): Sum| (sum / count).sqrt();
+        PairScore {
+            left_out: from.members[0].subject.clone(),
+            from: from.parameter,
+            to: to.parameter,
+            method,
+            rms_deg: rms(metric_sum(&sums, 2)).to_degrees(),
+            rms_mm: 1e3 * rms(metric_sum(&sums, 3)),
         }
     }
 
