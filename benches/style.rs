@@ -42,8 +42,12 @@ fn main() {
             let best = (0..ROUNDS).map(|_| timed_ms(|| postures(posture))).fold(f64::MAX, f64::min);
             1e6 * best / POSTURES as f64
         };
-        let fast_ns = ns(&|phase| drop(black_box(tables.at(black_box(used), phase))));
-        let exact_ns = ns(&|phase| drop(black_box(model.posture(black_box(used), phase))));
+        let fast_ns = ns(&|phase| {
+            black_box(tables.at(black_box(used), phase));
+        });
+        let exact_ns = ns(&|phase| {
+            black_box(model.posture(black_box(used), phase));
+        });
         println!("| {} | {fast_ns:.0} | {:.2} million | {exact_ns:.0} |", used.len(), 1e3 / fast_ns);
     }
     players(&model);

@@ -38,12 +38,6 @@ pub struct Postures {
     mean_rotations: [UnitQuaternion<f64>; BALL_JOINTS],
 }
 
-/// Row (1) and its rotations, w x y z by place.
-struct Turned {
-    row: [f32; ROW],
-    quaternions: [[f32; PLACES]; 4],
-}
-
 impl Postures {
     /// The first `count` components of `model`, with what a person's weights do not hold.
     pub fn new(model: &Model, count: usize, detail: Option<&Detail>) -> Postures {
@@ -71,25 +65,29 @@ impl Postures {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
-            return self.opened(unsafe { self.turned_avx2(weights, phase) });
+            return unsafe { self.at_avx2(weights, phase) };
         }
-        self.opened(self.turned(weights, phase))
+        self.at_any(weights, phase)
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn turned_avx2(&self, weights: &[f64], phase: f64) -> Turned {
-        self.turned(weights, phase)
+    fn at_avx2(&self, weights: &[f64], phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
+        self.at_any(weights, phase)
     }
 
     #[inline(always)]
-    fn turned(&self, weights: &[f64], phase: f64) -> Turned {
+    fn at_any(&self, weights: &[f64], phase: f64) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
         let (before, after, part) = neighbours(self.activity, phase);
         let rows = |sample: usize| &self.rows[sample * self.per_sample..][..self.per_sample];
+        let (before, after) = (rows(before), rows(after));
+        let (u, v) = ((1.0 - part) as f32, part as f32);
         let mut row = [0.0; ROW];
-        let all = std::iter::once(1.0).chain(weights.iter().copied());
-        for ((weight, a), b) in all.zip(rows(before)).zip(rows(after)) {
-            let (of_a, of_b) = ((weight * (1.0 - part)) as f32, (weight * part) as f32);
+        for i in 0..ROW {
+            row[i] = u * before[0][i] + v * after[0][i];
+        }
+        for ((weight, a), b) in weights.iter().zip(&before[1..]).zip(&after[1..]) {
+            let (of_a, of_b) = (*weight as f32 * u, *weight as f32 * v);
             for i in 0..ROW {
                 row[i] += of_a * a[i] + of_b * b[i];
             }
@@ -116,23 +114,24 @@ impl Postures {
             quaternions[2][j] = mw * y - mx * z + my * w + mz * x;
             quaternions[3][j] = mw * z + mx * y - my * x + mz * w;
         }
-        Turned { row, quaternions }
-    }
-
-    /// In the types of the rest, with closed forms where the series fades.
-    #[inline(always)]
-    fn opened(&self, Turned { row, quaternions }: Turned) -> ([UnitQuaternion<f64>; BALL_JOINTS], RootSample) {
-        let joints = std::array::from_fn(|j| {
-            let v = Vector3::new(row[j], row[PLACES + j], row[2 * PLACES + j]).map(f64::from);
-            if v.norm_squared() > FADING {
-                return self.mean_rotations[j] * exp(&v);
-            }
+        let mut joints = std::array::from_fn(|j| {
             let [w, x, y, z] = [0, 1, 2, 3].map(|axis: usize| f64::from(quaternions[axis][j]));
             UnitQuaternion::new_unchecked(Quaternion::new(w, x, y, z))
         });
+        if h2.iter().any(|h2| *h2 > (0.25 * FADING) as f32) {
+            self.turn_far(&row, &h2, &mut joints);
+        }
         let channel = |k: usize| f64::from(row[3 * PLACES + k]);
         let (rotation, position) = (Vector3::from_fn(|k, _| channel(k)), Vector3::from_fn(|k, _| channel(3 + k)));
         (joints, RootSample { rotation, position })
+    }
+
+    /// The closed form for joints whose series fade.
+    #[cold]
+    fn turn_far(&self, row: &[f32; ROW], h2: &[f32; PLACES], joints: &mut [UnitQuaternion<f64>; BALL_JOINTS]) {
+        for (j, joint) in joints.iter_mut().enumerate().filter(|(j, _)| h2[*j] > (0.25 * FADING) as f32) {
+            *joint = self.mean_rotations[j] * exp(&Vector3::new(row[j], row[PLACES + j], row[2 * PLACES + j]).map(f64::from));
+        }
     }
 }
 
@@ -206,7 +205,7 @@ mod tests {
         for k in 0..250 {
             let phase = 0.618 * f64::from(k);
             let (joints, root) = postures.at(weights.as_slice(), phase);
-            let (plain, plain_root) = postures.opened(postures.turned(weights.as_slice(), phase));
+            let (plain, plain_root) = postures.at_any(weights.as_slice(), phase);
             assert_eq!(root, plain_root);
             assert!(joints.iter().zip(&plain).all(|(a, b)| a.coords == b.coords));
         }

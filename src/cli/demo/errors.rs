@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use super::table::Row;
 use super::{Generated, SPEED_M_S, Truth, at_speed};
-use crate::cli::track::{self, NamedModel, Tracked};
+use crate::cli::track::{NamedModel, Tracked};
 
 /// Points of one frame whose distance to the skin is measured.
 const POINTS: usize = 2000;
