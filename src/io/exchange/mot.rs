@@ -309,8 +309,9 @@ pub(in crate::io) mod tests {
             (LAnkle, 10.0),
             (RAnkle, 10.0),
             (Vt1, 1e-4),
-            (LShoulder, 14.0),
-            (RShoulder, 14.0),
+            // About themselves; their directions are held below.
+            (LShoulder, 45.0),
+            (RShoulder, 45.0),
             (LWrist, 1e-4),
             (RWrist, 1e-4),
         ] {
@@ -324,7 +325,7 @@ pub(in crate::io) mod tests {
             let off =
                 clip.poses.iter().zip(&back.poses).map(|(p, q)| along(&clip, p).angle(&along(&back, q)).to_degrees()).fold(0.0, f64::max);
             println!("direction of the segment below {}: {off:.3} degrees", joint.name());
-            assert!(off < if down.z > 0.0 { 4.0 } else { 0.5 }, "{}: {off} degrees", joint.name());
+            assert!(off < if down.z > 0.0 { 8.0 } else { 1.0 }, "{}: {off} degrees", joint.name());
         }
         let pelvis = |clip: &Clip, pose: &Pose| clip.place(pose).position(Root);
         let off = clip.poses.iter().zip(&back.poses).map(|(p, q)| (pelvis(&clip, p) - pelvis(&back, q)).norm()).fold(0.0, f64::max);
