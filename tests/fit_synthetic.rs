@@ -137,7 +137,8 @@ fn what_people_do_is_found_by_evidence() {
     let models = Activity::ALL.map(|activity| Model::build(activity, true, &synthetic::database(activity)).unwrap());
     let models = models.each_ref();
     let options = FitOptions { points: 200, rays: 40, deviations: false, ..FitOptions::default() };
-    for (k, (activity, parameter)) in [(Activity::Jumping, 0.8), (Activity::Running, 2.6), (Activity::Walking, 1.3)].into_iter().enumerate() {
+    for (k, (activity, parameter)) in [(Activity::Jumping, 0.8), (Activity::Running, 2.6), (Activity::Walking, 1.3)].into_iter().enumerate()
+    {
         let subject = synthetic::subject(activity, 1000 + k as u64);
         let (cycle, shape) = (subject.cycle(parameter, 0), subject.shape());
         let length = if activity.is_cyclic() { Length::Seconds(1.2) } else { Length::Cycles(1) };

@@ -96,7 +96,8 @@ fn track(frames: &[Vec<GrayImage>]) -> Tracked {
             frame.save(session.join(format!("{}/{number:06}.png", camera.name))).unwrap();
         }
     }
-    let done = Command::cargo_bin("muybridge").unwrap().arg("track").arg(&session).arg("-o").arg(&output).arg("--no-report").output().unwrap();
+    let done =
+        Command::cargo_bin("muybridge").unwrap().arg("track").arg(&session).arg("-o").arg(&output).arg("--no-report").output().unwrap();
     let said = String::from_utf8([done.stdout, done.stderr].concat()).unwrap();
     let code = done.status.code().unwrap();
     if code != 0 {

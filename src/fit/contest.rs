@@ -11,6 +11,8 @@
 //! Fails when: the person does two things in one sequence.
 //! Checked against phantoms that walk, run and jump, and recorded walks and a run.
 
+use nalgebra::DMatrix;
+
 use super::curve::Curve;
 use super::problem::{Frame, Known, Problem, Settings};
 use super::start::{self, Track};
@@ -52,24 +54,6 @@ pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known:
     let mut run = Run { known: *known, residual: PointResidual::Distance, iterations: 0, checkpoints: &Checkpoints::NONE, stages: 0 };
     let search = Settings { model_m: SEARCH_M, ..SETTINGS };
     let rough = Settings { model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, ..SETTINGS };
-    for model in models {
-        let t0 = std::time::Instant::now();
-        let mean = Curve::new(model, 0);
-        let found = start::hypotheses(&track, &frames, &mean, model, &search, known);
-        let t1 = t0.elapsed();
-        for h in pair(&found) {
-            let state = run.placed(h.state.clone(), &frames, &mean);
-            let p = Problem::new(&mean, &frames, &rough, super::TURNED, known, &state);
-            let (d0, p0) = (total(&p.fitness).cost, p.prior_cost(&state));
-            let ten = Curve::new(model, 10);
-            let t2 = t0.elapsed();
-            let state = run.styled(state, &frames, &ten);
-            let p = Problem::new(&ten, &frames, &rough, STYLED, known, &state);
-            let (d1, p1) = (total(&p.fitness).cost, p.prior_cost(&state));
-            let occam = cost(&ten, &frames, &rough, known, &state) - d1 - p1;
-            eprintln!("DBG {} grid {:.0} mean {d0:.0}+{p0:.0} ten {d1:.0}+{p1:.0}+{occam:.0} = {:.0}; frames {} {t1:.0?} {t2:.0?} {:.0?}", model.activity, h.cost, d1+p1+occam, frames.len(), t0.elapsed());
-        }
-    }
     let placed: Vec<Vec<(f64, State)>> = models
         .iter()
         .map(|model| {
@@ -116,7 +100,7 @@ fn cost(curve: &Curve, frames: &[Frame], settings: &Settings, known: &Known, sta
     let weights = curve.components();
     let occam = covariance.map_or(0.0, |c| {
         let scale = |i: usize| curve.eigenvalues[i].sqrt();
-        let relative = nalgebra::DMatrix::from_fn(weights, weights, |i, j| c[(i, j)] / (scale(i) * scale(j)));
+        let relative = DMatrix::from_fn(weights, weights, |i, j| c[(i, j)] / (scale(i) * scale(j)));
         -0.5 * relative.determinant().ln()
     });
     total(&problem.fitness).cost + problem.prior_cost(state) + occam

@@ -83,7 +83,15 @@ impl Default for FitOptions {
     /// Twenty components reach 2.5 degrees against the true joints where ten reach 4 (fit on CMU walks); 500 points and
     /// 100 rays a frame cost about the same as the silhouettes' search and more change nothing.
     fn default() -> Self {
-        FitOptions { components: 20, variance: None, points: 500, rays: 100, deviations: true, lengths: true, residual: PointResidual::Distance }
+        FitOptions {
+            components: 20,
+            variance: None,
+            points: 500,
+            rays: 100,
+            deviations: true,
+            lengths: true,
+            residual: PointResidual::Distance,
+        }
     }
 }
 
@@ -341,7 +349,20 @@ fn finish(run: Run, state: State, free: Free, curve: Curve, frames: &[Frame], ob
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
     let (up, hypotheses) = (run.known.up, [f64::NAN; 2]);
     let candidates = Vec::new();
-    Fit { model: 0, candidates, up, poses, uncertainty, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
+    Fit {
+        model: 0,
+        candidates,
+        up,
+        poses,
+        uncertainty,
+        frames,
+        hypotheses,
+        iterations: run.iterations,
+        speed_m_s,
+        cadence_hz,
+        state,
+        curve,
+    }
 }
 
 impl Fit {

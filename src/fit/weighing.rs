@@ -250,8 +250,8 @@ fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vec
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fit::problem::tests::KNOWN;
     use crate::fit::curve::tests::made_up_model;
+    use crate::fit::problem::tests::KNOWN;
     use crate::fit::problem::tests::{frames, state};
 
     #[test]

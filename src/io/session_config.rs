@@ -101,8 +101,7 @@ mod tests {
             fs::create_dir(folder).unwrap();
             fs::write(folder.join(FILE), text).unwrap();
         }
-        let relative =
-            |m: &PathBuf| m.strip_prefix(place.path()).unwrap().to_path_buf();
+        let relative = |m: &PathBuf| m.strip_prefix(place.path()).unwrap().to_path_buf();
         read(&folders[2]).map(|c| SessionConfig { model: c.model.iter().map(relative).collect(), ..c }).map_err(|e| e.to_string())
     }
 

@@ -48,7 +48,10 @@ pub fn run(args: &SweepsArgs) -> Result<()> {
     let embedded = NamedModel::embedded()?;
     let models: Vec<&Model> = embedded.iter().map(|m| &m.model).collect();
     let wanted = |table| args.only.is_empty() || args.only.contains(&table);
-    println!("phantom walks of 1.5 s at 1.3 m/s, people outside the models (embedded synthetic, all three compete), mean of {} per row", args.people);
+    println!(
+        "phantom walks of 1.5 s at 1.3 m/s, people outside the models (embedded synthetic, all three compete), mean of {} per row",
+        args.people
+    );
     println!("{:<34}{:>10}{:>10}{:>8}", "", "joints mm", "legs deg", "right");
     let base = Walk::default();
     let sight = |sight: SightOptions| Walk { sight, ..Walk::default() };
