@@ -1,8 +1,8 @@
 //! What each measurement counts: Cauchy weights over variances along the normal, gates, and how well a state explains all.
 //!
 //! ω = base / ((nᵀ Σ n + σ²) (1 + (r/cσ)²)). Weights, κ and the points of rays are frozen for one solver run.
-//! A cloud point counts with its distance to the skin; as [`PointResidual::Ray`] with the distance t along its line of sight d from
-//! where that meets the front of the body, y: r = −t nᵀd + κ (√d_eff(y) − √d_0), y and t frozen.
+//! A cloud point counts with its distance to the skin; as [`PointResidual::Ray`] with how far it lies along its line of sight d
+//! behind where that meets the front of the body, y, with normal n: r = t nᵀd + κ (√d_eff(y) − √d_0), y and t frozen.
 //! Checked against a dense search (rays, lines of sight); the weights enter the Jacobian tests of `problem`.
 
 use nalgebra::Vector3;
@@ -147,7 +147,7 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
             node: nearest.map_or(0, |share| surface.primitives[share.primitive].node as u8),
             is_point,
             residual: if is_point { settings.residual } else { PointResidual::Distance },
-            offset_m: -deeper_m * normal.dot(&(x - known.viewpoint).normalize()),
+            offset_m: deeper_m * normal.dot(&(x - known.viewpoint).normalize()),
             ..Frozen::default()
         };
         let distance_m = frozen.at(evaluation.root()).0;
@@ -251,8 +251,7 @@ fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vec
 mod tests {
     use super::*;
     use crate::fit::curve::tests::made_up_model;
-    use crate::fit::problem::tests::KNOWN;
-    use crate::fit::problem::tests::{frames, state};
+    use crate::fit::problem::tests::{KNOWN, SETTINGS, frames, state};
 
     #[test]
     fn ray_point_is_the_least_of_a_dense_search() {
@@ -289,5 +288,29 @@ mod tests {
             }
         }
         assert!(met > surface.primitives.len() / 2, "{met}");
+    }
+
+    #[test]
+    fn just_before_the_front_distance_and_line_of_sight_agree() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let surface = state.posed(&curve, &Surface::new(&state.shape), 0).surface;
+        let eye = KNOWN.viewpoint;
+        let mut targets = Vec::new();
+        for p in &surface.primitives {
+            let y = front(&surface, &eye, &p.centre, &mut Evaluation::default());
+            let normal = surface.gradient(&y).normalize();
+            if surface.distance(&y).abs() < 1e-3 && normal.dot(&(y - eye).normalize()) < -0.7 {
+                targets.push(Target::Point { x: y + normal * 0.004, covariance: nalgebra::Matrix3::zeros() });
+            }
+        }
+        assert!(targets.len() > 5, "{}", targets.len());
+        let frame = Frame { targets, ..Frame::default() };
+        for residual in [PointResidual::Distance, PointResidual::Ray, PointResidual::Field] {
+            for frozen in freeze(&frame, &surface, &Settings { residual, ..SETTINGS }, &KNOWN).0 {
+                assert!((frozen.distance_m - 0.004).abs() < 1.5e-3, "{residual:?}: {}", frozen.distance_m);
+            }
+        }
     }
 }
