@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
+use muybridge::clouds::{CloudError, CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::Observation;
 use muybridge::footage::FrameSet;
 use muybridge::io::frame_cloud;
@@ -14,8 +14,10 @@ use super::{interrupt, progress};
 
 /// Frames that are in memory at once.
 const BATCH: usize = 8;
+/// One frame in so many may have a black picture: it counts as not seen.
+const BLANK: usize = 2;
 
-/// Clouds of all frames; `each` sees every frame with its pictures, in order. What stereo finds is kept in the folder `kept`
+/// Clouds of all frames, empty where a camera shows nothing; `each` sees every frame with its pictures, in order. What stereo finds is kept in the folder `kept`
 /// and taken from there the next time, so that work that was stopped goes on; the folder's name must tell footage, options
 /// and program.
 pub fn observe(
@@ -28,12 +30,13 @@ pub fn observe(
     let bar = progress::bar("clouds", session.frame_count as u64);
     let mut observations = Vec::with_capacity(session.frame_count);
     let mut frames = session.frames();
+    let mut blank = Vec::new();
     loop {
         let batch: Vec<FrameSet> = frames.by_ref().take(BATCH).collect::<Result<_, _>>()?;
         if batch.is_empty() {
             break;
         }
-        let clouds: Vec<FrameCloud> = batch
+        let clouds: Vec<Result<FrameCloud>> = batch
             .par_iter()
             .map(|frame| {
                 interrupt::check()?;
@@ -41,13 +44,26 @@ pub fn observe(
                 bar.inc(1);
                 cloud
             })
-            .collect::<Result<_>>()?;
+            .collect();
         for (frame, cloud) in batch.iter().zip(clouds) {
+            let cloud = match cloud {
+                Err(error) if matches!(error.downcast_ref::<CloudError>(), Some(CloudError::Blank { .. })) => {
+                    blank.push(error);
+                    FrameCloud::unseen(session.rig.cameras.len())
+                }
+                cloud => cloud?,
+            };
             each(frame, &cloud)?;
             observations.push(Observation { number: frame.number, time_s: frame.time_s, cloud: cloud.cloud, masks: cloud.masks });
         }
     }
     bar.finish();
+    if BLANK * blank.len() > session.frame_count {
+        return Err(blank.swap_remove(0)).with_context(|| session.folder.display().to_string());
+    }
+    if let Some(first) = blank.first() {
+        eprintln!("warning: nothing is taken from {} of {} frames, the first is {first:#}", blank.len(), session.frame_count);
+    }
     if observations.iter().all(|o| o.cloud.points.is_empty()) {
         bail!(
             "{}: nobody is in view in any of the {} frames; check that the pictures show a person that the stage pictures do not",

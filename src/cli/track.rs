@@ -9,8 +9,9 @@ use muybridge::body::{Clip, NODES, Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
 use muybridge::fit::{self, Checkpoints, Fit, FitOptions, Observation, own_motion};
 use muybridge::footage::FrameSet;
+use muybridge::io::fit_json::ModelName;
 use muybridge::io::outputs_json::Source;
-use muybridge::io::session_config::{self, DEFAULT_ACTIVITY, SessionConfig};
+use muybridge::io::session_config::{self, SessionConfig};
 use muybridge::io::{content, fit_checkpoint, fit_json, joints_csv, model_npz, session::Session, style_json};
 use muybridge::math::euler::Order;
 use muybridge::motion_model::{Activity, Model, synthetic};
@@ -31,10 +32,11 @@ const STRIP: usize = 6;
 pub struct TrackArgs {
     /// Session folder with Calib.toml and one folder or video per camera
     session: PathBuf,
-    /// Motion model (.npz) of `muybridge model build`; the embedded synthetic one without it
-    #[arg(long)]
-    model: Option<PathBuf>,
-    /// Which embedded model to use; walking without it
+    /// Motion model (.npz) of `muybridge model build`; given several times, the one that explains the footage best is taken. Without it
+    /// the embedded synthetic ones compete: walking, running, jumping
+    #[arg(long, value_name = "FILE")]
+    model: Vec<PathBuf>,
+    /// Which embedded model to use
     #[arg(long, conflicts_with = "model")]
     activity: Option<ActivityName>,
     /// Folder for style.json, joints.csv, uncertainty.csv, motion.bvh, motion.glb, joints.trc, joints.c3d, angles.mot, outputs.json, fit.json
@@ -75,6 +77,26 @@ impl NamedModel {
         let model = Model::build(activity, true, &synthetic::database(activity))?;
         Ok(NamedModel::new(model, format!("embedded synthetic {activity} model")))
     }
+
+    /// All embedded models.
+    pub fn embedded() -> Result<Vec<NamedModel>> {
+        Activity::ALL.into_iter().map(NamedModel::synthetic).collect()
+    }
+
+    /// The models of a session's options.
+    fn of(config: &SessionConfig) -> Result<Vec<NamedModel>> {
+        match config.activity {
+            _ if !config.model.is_empty() => {
+                config.model.iter().map(|path| Ok(NamedModel::new(model_npz::read_model(path)?, file_name(path)))).collect()
+            }
+            Some(activity) => Ok(vec![NamedModel::synthetic(activity)?]),
+            None => NamedModel::embedded(),
+        }
+    }
+
+    fn report_name(&self) -> ModelName {
+        ModelName { model: self.name.clone(), model_hash: self.hash.clone(), activity: self.model.activity }
+    }
 }
 
 /// A fit with the session it belongs to.
@@ -108,32 +130,27 @@ impl TrackArgs {
 
 pub fn run(args: &TrackArgs) -> Result<()> {
     let config = args.config()?;
-    let model = match &config.model {
-        Some(path) => NamedModel::new(model_npz::read_model(path)?, file_name(path)),
-        None => NamedModel::synthetic(config.activity.unwrap_or(DEFAULT_ACTIVITY))?,
-    };
-    if model.model.synthetic {
+    let models = NamedModel::of(&config)?;
+    if models.iter().any(|model| model.model.synthetic) {
         eprintln!(
             "note: the model is synthetic; for figures that mean something build one from motion capture with `muybridge model build`"
         );
     }
     let (session, notices) = Session::open(&args.session, args.fps)?;
     notices.iter().for_each(|notice| eprintln!("note: {notice}"));
-    let mut options = FitOptions::default();
-    if let Some(variance) = config.variance {
-        options.components = model.model.components(variance);
-    }
+    let options = FitOptions { variance: config.variance, ..FitOptions::default() };
     let seen = look(&session, args.work.as_deref(), |_, _, _| Ok(()))?;
-    let kept = args.work.as_ref().map(|work| kept_folder(work, "fit", &session, &format!("{} {options:?} {}", model.hash, session.fps)));
-    let tracked = fit_to(&session, seen, &model, &options, kept.transpose()?.as_deref())?;
-    write(&args.output, &session, &model, &tracked)?;
+    let hashes: Vec<&str> = models.iter().map(|m| m.hash.as_str()).collect();
+    let kept = args.work.as_ref().map(|work| kept_folder(work, "fit", &session, &format!("{hashes:?} {options:?} {}", session.fps)));
+    let tracked = fit_to(&session, seen, &models, &options, kept.transpose()?.as_deref())?;
+    write(&args.output, &session, &models, &tracked)?;
     if !args.no_report {
-        track_report::write(&args.output, &session, &model, &tracked)?;
+        track_report::write(&args.output, &session, &models, &tracked)?;
     }
     if config.pictures == Some(true) {
-        draw(&args.output.join("pictures"), &session.rig, &model, &tracked)?;
+        draw(&args.output.join("pictures"), &session.rig, &models[tracked.fit.model], &tracked)?;
     }
-    summary(&args.output, &tracked.fit);
+    summary(&args.output, &models, &tracked.fit);
     Ok(())
 }
 
@@ -169,7 +186,7 @@ pub fn look(session: &Session, work: Option<&Path>, mut each: impl FnMut(&CloudR
 
 /// Depths in the reference view, metres.
 fn depth_of(rig: &CloudRig, found: &FrameCloud) -> Option<DepthMap> {
-    let (rectification, _) = rig.groups.first()?;
+    let (rectification, _) = rig.groups.first().filter(|_| !found.disparity.is_empty())?;
     let mut map = found.disparity.clone();
     map.pixels_mut().for_each(|d| d.0[0] = if d.0[0] > 0.0 { rectification.depth(d.0[0].into()) as f32 } else { f32::NAN });
     Some(map)
@@ -182,7 +199,7 @@ fn kept_folder(work: &Path, kind: &str, session: &Session, options: &str) -> Res
 }
 
 /// The fit to what was seen of a session; in the folder `kept` its state is kept after every iteration.
-pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOptions, kept: Option<&Path>) -> Result<Tracked> {
+pub fn fit_to(session: &Session, seen: Seen, models: &[NamedModel], options: &FitOptions, kept: Option<&Path>) -> Result<Tracked> {
     let Seen { observations, pictures, depth, floor_m } = seen;
     let bar = super::progress::bar("fit", 100);
     let done = std::cell::Cell::new(0);
@@ -193,7 +210,8 @@ pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOp
             let _ = kept.map(|folder| fit_checkpoint::write(folder, stage, at));
         },
     };
-    let fit = fit::resume(&observations, &session.rig, &model.model, floor_m, options, &checkpoints, &|share| {
+    let given: Vec<&Model> = models.iter().map(|m| &m.model).collect();
+    let fit = fit::resume(&observations, &session.rig, &given, floor_m, options, &checkpoints, &|share| {
         let percent = (100.0 * share) as u64;
         bar.inc(percent.saturating_sub(done.replace(percent)));
         !interrupt::came()
@@ -203,9 +221,10 @@ pub fn fit_to(session: &Session, seen: Seen, model: &NamedModel, options: &FitOp
     Ok(Tracked { fit, observations, pictures, depth })
 }
 
-/// Writes the files of a tracked session.
-pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
+/// Writes the files of a session that was tracked with the best of these models.
+pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<()> {
     let Tracked { fit, observations, .. } = tracked;
+    let model = &models[fit.model];
     let placements = placements(fit);
     let frames: Vec<(usize, f64)> = observations.iter().map(|o| (o.number, o.time_s)).collect();
     let positions: Vec<[Vector3<f64>; NODES]> = placements.iter().map(|p| p.positions).collect();
@@ -219,7 +238,8 @@ pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tra
     files.finish()?;
     style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
     let report = folder.join("fit.json");
-    fit_json::write(&report, fit, observations, &model.name, &model.hash).with_context(|| report.display().to_string())
+    let names: Vec<ModelName> = models.iter().map(NamedModel::report_name).collect();
+    fit_json::write(&report, fit, observations, &names).with_context(|| report.display().to_string())
 }
 
 fn placements(fit: &Fit) -> Vec<Placement> {
@@ -305,7 +325,18 @@ fn draw_curves(folder: &Path, tracked: &Tracked) -> Result<()> {
     Ok(report::save(&folder.join("root.png"), &picture)?)
 }
 
-fn summary(folder: &Path, fit: &Fit) {
+fn summary(folder: &Path, models: &[NamedModel], fit: &Fit) {
+    let model = &models[fit.model];
+    if let Some(second) = fit::contest::runner_up(&fit.candidates) {
+        let (costs, name) = ([fit.model, second].map(|k| fit.candidates[k].costs[0]), &models[second].name);
+        if costs[1] < UNDECIDED * costs[0] {
+            eprintln!(
+                "warning: the model may be the wrong one: {name} costs {:.0} against {:.0} for {}; name the right one with --model or --activity",
+                costs[1], costs[0], model.name
+            );
+        }
+        println!("{}: {}; it costs {:.0}, the next best, {name}, {:.0}", model.model.activity, model.name, costs[0], costs[1]);
+    }
     if fit.hypotheses[1] < UNDECIDED * fit.hypotheses[0] {
         eprintln!(
             "warning: with left and right legs exchanged the cost is {:.0} against {:.0}; look at the report before you trust the sides",

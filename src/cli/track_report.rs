@@ -14,8 +14,9 @@ use super::track::{NamedModel, Tracked, clip, style};
 
 /// Writes report.html, thumbnail.jpg and, for gaits, gait.csv and angles_cycle.csv. The page names
 /// the session by its folder alone, so that it is the same wherever the study stands.
-pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<()> {
+pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<()> {
     let Tracked { fit, observations, pictures, depth } = tracked;
+    let model = &models[fit.model];
     let whole = session.folder.canonicalize().unwrap_or_else(|_| session.folder.clone());
     let name = file_name(&whole);
     let (clip, _) = clip(fit, &session.rig, observations, session.fps)?;
@@ -33,6 +34,7 @@ pub fn write(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tra
         model: &model.model,
         model_name: &model.name,
         model_hash: &model.hash,
+        given: &models.iter().map(|m| m.name.as_str()).collect::<Vec<_>>(),
         fit,
         observations,
         pictures,

@@ -70,6 +70,14 @@ pub struct FrameCloud {
     pub changed: GrayImage,
 }
 
+impl FrameCloud {
+    /// Nothing, seen by so many cameras.
+    pub fn unseen(cameras: usize) -> FrameCloud {
+        let (cloud, masks) = (Cloud { points: Vec::new() }, vec![None; cameras]);
+        FrameCloud { cloud, masks, disparity: Plane::new(0, 0), matched: Plane::new(0, 0), changed: GrayImage::new(0, 0) }
+    }
+}
+
 /// A rig made ready for footage: its rectified groups, and the empty stage as each of them sees it.
 #[derive(Clone, Debug)]
 pub struct CloudRig {

@@ -1,6 +1,7 @@
 //! Fitting the body to the clouds of all frames at once: style paper §6.1, starting by itself.
 //!
-//! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]) → root, phases, weights, shape by
+//! Observations ([`targets`]) → which of several models, on few frames ([`contest`]) → track, heading, cadence and phase by
+//! search ([`start`]) → root, phases, weights, shape by
 //! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart,
 //! then with more components and all points, at last with turns of single joints against the model → poses, weights, shape
 //! and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
@@ -8,6 +9,7 @@
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
+pub mod contest;
 pub mod curve;
 pub mod own_motion;
 pub mod people;
@@ -29,11 +31,13 @@ use crate::body::{Pose, Shape};
 use crate::math::arrow::{LmOptions, minimise};
 use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
+pub use contest::Candidate;
 use curve::Curve;
 use problem::{Frame, Free, Known, Outside, Problem, Settings};
 use state::{State, Turns};
 pub use targets::Observation;
 pub use uncertainty::Uncertainty;
+pub use weighing::PointResidual;
 use weighing::{Fitness, fitness, total};
 
 /// Why a fit cannot begin.
@@ -43,7 +47,7 @@ pub enum FitError {
         "nobody to fit: only {with_person} of {frames} frames have a cloud of {points} points or more; check that a person walks through the view of all cameras and that the empty-stage pictures belong to this session"
     )]
     NobodySeen { frames: usize, with_person: usize, points: usize },
-    #[error("{frames} frames are too few for a motion, the fit needs {needed} or more; give it the whole sequence")]
+    #[error("the footage has too few frames for a motion, {frames} where {needed} or more are needed; give it the whole sequence")]
     TooShort { frames: usize, needed: usize },
     #[error(
         "{crowded} of {frames} frames show two people or more, who cannot be told apart; keep one person on the stage, or cut the frames with the others out"
@@ -60,6 +64,8 @@ pub enum FitError {
 pub struct FitOptions {
     /// Components of the model in the last stage.
     pub components: usize,
+    /// As many components as hold this part of the model's variance, in place of `components`.
+    pub variance: Option<f64>,
     /// Cloud points per frame in the last stages.
     pub points: usize,
     /// Silhouette rays per camera and frame.
@@ -69,13 +75,23 @@ pub struct FitOptions {
     pub deviations: bool,
     /// Whether limbs may be longer or shorter than the template's.
     pub lengths: bool,
+    /// What of a cloud point is made small in the last stages.
+    pub residual: PointResidual,
 }
 
 impl Default for FitOptions {
     /// Twenty components reach 2.5 degrees against the true joints where ten reach 4 (fit on CMU walks); 500 points and
     /// 100 rays a frame cost about the same as the silhouettes' search and more change nothing.
     fn default() -> Self {
-        FitOptions { components: 20, points: 500, rays: 100, deviations: true, lengths: true }
+        FitOptions {
+            components: 20,
+            variance: None,
+            points: 500,
+            rays: 100,
+            deviations: true,
+            lengths: true,
+            residual: PointResidual::Distance,
+        }
     }
 }
 
@@ -90,6 +106,9 @@ pub struct Fit {
     /// How sure all that is; `None` where the equations are singular.
     pub uncertainty: Option<Uncertainty>,
     pub frames: Vec<Fitness>,
+    /// Which of the models this is, by its place among those that were given, and how all of them did where several were.
+    pub model: usize,
+    pub candidates: Vec<Candidate>,
     /// Robust costs of the chosen and the half-cycle-shifted hypothesis when the choice was made.
     pub hypotheses: [f64; 2],
     pub iterations: u64,
@@ -103,6 +122,7 @@ pub struct Fit {
 
 /// The last stages of a fit. Accelerations are those of a steady walk: larger values let noise through, smaller ones cut corners.
 pub const SETTINGS: Settings = Settings {
+    residual: PointResidual::Distance,
     model_m: 0.02,
     point_weight: 0.16,
     ray_weight: 0.16,
@@ -125,6 +145,9 @@ const CROWDED: usize = 4;
 
 /// Steadiness of the phase while the start is still rough.
 const STEADY_PHASE: f64 = 0.3;
+/// Difference between skins in the search for a start, and once weights are found roughly, metres.
+const SEARCH_M: f64 = 0.06;
+const ROUGH_M: f64 = 0.04;
 
 #[derive(Clone, Copy)]
 struct Stage {
@@ -165,8 +188,8 @@ impl Checkpoints<'_> {
 
 /// Everything one run needs beside the state.
 struct Run<'a> {
-    model: &'a Model,
     known: Known,
+    residual: PointResidual,
     iterations: u64,
     checkpoints: &'a Checkpoints<'a>,
     /// Stages begun.
@@ -176,7 +199,8 @@ struct Run<'a> {
 impl Run<'_> {
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
     fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
-        let settings = Settings { model_m: stage.model_m, phase_acceleration: stage.phase_acceleration, ..SETTINGS };
+        let (model_m, phase_acceleration) = (stage.model_m, stage.phase_acceleration);
+        let settings = Settings { model_m, phase_acceleration, residual: self.residual, ..SETTINGS };
         let begun = (self.checkpoints.load)(self.stages);
         let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, cost: f64::INFINITY, state });
         while at.rounds < stage.refreshes {
@@ -194,42 +218,44 @@ impl Run<'_> {
         at.state
     }
 
-    /// The rough stages, from the mean motion to ten weights, stature and widths.
-    fn rough(&mut self, state: State, frames: &[Frame]) -> State {
-        let mean = Curve::new(self.model, 0);
-        let ten = Curve::new(self.model, 10);
-        let mut state = State { weights: Vec::new(), ..state };
-        state = self.stage(state, frames, &mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 });
-        state = self.stage(state, frames, &mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 });
-        state.weights = vec![0.0; ten.components()];
-        self.stage(state, frames, &ten, &Stage { free: STYLED, model_m: 0.04, phase_acceleration: STEADY_PHASE, refreshes: 8 })
+    /// The first rough stages: the mean motion `mean`, placed and turned.
+    fn placed(&mut self, state: State, frames: &[Frame], mean: &Curve) -> State {
+        let state = State { weights: Vec::new(), ..state };
+        let state = self.stage(state, frames, mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 });
+        self.stage(state, frames, mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 })
+    }
+
+    /// The last rough stage: the weights of `ten`, stature and widths.
+    fn styled(&mut self, state: State, frames: &[Frame], ten: &Curve) -> State {
+        let state = State { weights: vec![0.0; ten.components()], ..state };
+        self.stage(state, frames, ten, &Stage { free: STYLED, model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, refreshes: 8 })
     }
 }
 
-/// Fits `model` to the observations of one session, with the floor at height `floor_m` along the rig's up axis where it is
+/// Fits the one of `models` that explains them best to the observations of one session, with the floor at height `floor_m` along the rig's up axis where it is
 /// known; `progress` is told the share done and says whether to go on.
 pub fn fit(
     observations: &[Observation],
     rig: &Rig,
-    model: &Model,
+    models: &[&Model],
     floor_m: Option<f64>,
     options: &FitOptions,
     progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
-    resume(observations, rig, model, floor_m, options, &Checkpoints::NONE, progress)
+    resume(observations, rig, models, floor_m, options, &Checkpoints::NONE, progress)
 }
 
-/// [`fit`] with checkpoints, which must be of the same observations, rig, model and options.
+/// [`fit`] with checkpoints, which must be of the same observations, rig, models and options.
 pub fn resume(
     observations: &[Observation],
     rig: &Rig,
-    model: &Model,
+    models: &[&Model],
     floor_m: Option<f64>,
     options: &FitOptions,
     checkpoints: &Checkpoints,
     progress: &dyn Fn(f64) -> bool,
 ) -> Result<Fit, FitError> {
-    if model.members.is_empty() {
+    if models.is_empty() || models.iter().any(|model| model.members.is_empty()) {
         return Err(FitError::EmptyModel);
     }
     let step = |share| if progress(share) { Ok(()) } else { Err(FitError::Interrupted) };
@@ -251,31 +277,37 @@ pub fn resume(
     };
     let sparse = chosen(200, 40);
     step(0.0)?;
-    let mean = Curve::new(model, 0);
-    let search = Settings { model_m: 0.06, ..SETTINGS };
+    let candidates = if models.len() > 1 { contest::contest(models, &track, &sparse, &known) } else { Vec::new() };
+    let chosen_model = contest::best(&candidates);
+    let model = models[chosen_model];
+    let (mean, ten) = (Curve::new(model, 0), Curve::new(model, 10));
+    step(0.08)?;
+    let search = Settings { model_m: SEARCH_M, ..SETTINGS };
     let found = start::hypotheses(&track, &sparse, &mean, model, &search, &known);
-    let mut run = Run { model, known, iterations: 0, checkpoints, stages: 0 };
+    let mut run = Run { known, residual: PointResidual::Distance, iterations: 0, checkpoints, stages: 0 };
     step(0.1)?;
-    let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
-    let ten = Curve::new(model, 10);
-    let mut candidates: Vec<(f64, State)> = pair(&found)
+    let rough_settings = Settings { model_m: ROUGH_M, ..SETTINGS };
+    let mut halves: Vec<(f64, State)> = pair(&found)
         .into_iter()
         .map(|h| {
-            let state = run.rough(h.state.clone(), &sparse);
+            let placed = run.placed(h.state.clone(), &sparse, &mean);
+            let state = run.styled(placed, &sparse, &ten);
             (total(&fitness(&ten, &sparse, &rough_settings, &known, &state)).cost, state)
         })
         .collect();
-    candidates.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let hypotheses = [candidates[0].0, candidates.last().map_or(candidates[0].0, |c| c.0)];
-    let mut state = candidates.swap_remove(0).1;
+    halves.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let hypotheses = [halves[0].0, halves.last().map_or(halves[0].0, |c| c.0)];
+    let mut state = halves.swap_remove(0).1;
 
+    run.residual = options.residual;
+    let settings = Settings { residual: options.residual, ..SETTINGS };
     let dense = chosen(options.points, options.rays);
     step(0.4)?;
     let shaped = if options.lengths { SHAPED } else { STYLED };
     let last = Stage { free: shaped, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
     state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
     step(0.55)?;
-    let curve = Curve::new(model, options.components);
+    let curve = Curve::new(model, options.variance.map_or(options.components, |part| model.components(part)));
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &dense, &curve, &last);
     step(0.7)?;
@@ -286,13 +318,14 @@ pub fn resume(
         let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
         step(0.85)?;
         let left_out: Vec<Frame> = observations.iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
-        let cost = |state: &State| total(&fitness(&curve, &left_out, &SETTINGS, &known, state)).cost;
+        let cost = |state: &State| total(&fitness(&curve, &left_out, &settings, &known, state)).cost;
         if cost(&own) < cost(&state) {
             (state, free) = (own, posed);
         }
     }
     step(0.95)?;
-    Ok(finish(run, state, free, curve, &dense, observations, hypotheses))
+    let fit = finish(run, state, free, curve, &dense, observations);
+    Ok(Fit { model: chosen_model, candidates, hypotheses, ..fit })
 }
 
 /// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.
@@ -303,17 +336,33 @@ fn pair(found: &[start::Hypothesis]) -> Vec<&start::Hypothesis> {
     std::iter::once(best).chain(opposite).collect()
 }
 
-fn finish(run: Run, state: State, free: Free, curve: Curve, frames: &[Frame], observations: &[Observation], hypotheses: [f64; 2]) -> Fit {
-    let uncertainty = uncertainty::uncertainty(&curve, frames, &SETTINGS, free, &run.known, &state);
-    let frames = fitness(&curve, frames, &SETTINGS, &run.known, &state);
+/// The fit without what was said of its rivals.
+fn finish(run: Run, state: State, free: Free, curve: Curve, frames: &[Frame], observations: &[Observation]) -> Fit {
+    let settings = Settings { residual: run.residual, ..SETTINGS };
+    let uncertainty = uncertainty::uncertainty(&curve, frames, &settings, free, &run.known, &state);
+    let frames = fitness(&curve, frames, &settings, &run.known, &state);
     let poses = (0..state.carriers.len()).map(|t| state.pose(&curve, t)).collect();
     let seconds = observations.last().map_or(0.0, |o| o.time_s) - observations.first().map_or(0.0, |o| o.time_s);
     let (first, last) = (&state.carriers[0], &state.carriers[state.carriers.len() - 1]);
     let travelled: f64 =
         state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.known.up * d.dot(&run.known.up)).norm()).sum();
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
-    let up = run.known.up;
-    Fit { up, poses, uncertainty, frames, hypotheses, iterations: run.iterations, speed_m_s, cadence_hz, state, curve }
+    let (up, hypotheses) = (run.known.up, [f64::NAN; 2]);
+    let candidates = Vec::new();
+    Fit {
+        model: 0,
+        candidates,
+        up,
+        poses,
+        uncertainty,
+        frames,
+        hypotheses,
+        iterations: run.iterations,
+        speed_m_s,
+        cadence_hz,
+        state,
+        curve,
+    }
 }
 
 impl Fit {

@@ -20,7 +20,7 @@ use rayon::prelude::*;
 
 use super::curve::Curve;
 use super::state::{LOCAL, Layout, Motion, State};
-use super::weighing::{Fitness, Frozen, FrozenOutside, freeze, freeze_outsides, outside_px};
+use super::weighing::{Fitness, Frozen, FrozenOutside, PointResidual, freeze, freeze_outsides, outside_px};
 use super::wrench::{FrameNormal, Gathered, Gradient, Pull};
 use crate::body::surface::{Evaluation, SKIN};
 use crate::body::{Joint, Length, NODES, PosedSurface, Surface};
@@ -57,6 +57,7 @@ pub struct Frame {
 /// Standard deviations and weights of equation (1).
 #[derive(Clone, Debug)]
 pub struct Settings {
+    pub residual: PointResidual,
     /// Difference between the person's skin and the model's, m; large at the start so that far points pull.
     pub model_m: f64,
     /// Share of a cloud point that is new information: neighbours share their correlation window.
@@ -156,7 +157,7 @@ impl<'a> Problem<'a> {
         pull.size(size(layout.length(p.limb)), force.dot(&growth));
     }
 
-    /// Residual κ(√d_eff − √d_0), with the pull whose multiple by the second value is its derivative.
+    /// The residual as frozen, with the pull whose multiple by the second value is its derivative.
     fn residual(motion: &Motion, state: &State, frame: usize, frozen: &Frozen, scratch: &mut Scratch) -> (f64, f64) {
         let surface = &motion.surface;
         surface.evaluate_among(&frozen.near, &frozen.x, &mut scratch.evaluation);
@@ -177,7 +178,8 @@ impl<'a> Problem<'a> {
             pull.size(size(layout.width(p.limb)), in_node.dot(&p.widening(&share.unit)) / width);
         }
         pull.size(0, force.dot(&(frozen.x - state.carriers[frame].position)));
-        (frozen.metres_per_root * (e.root() - SKIN.sqrt()), -frozen.metres_per_root * e.root_slope())
+        let (residual, slope) = frozen.at(e.root());
+        (residual, -slope * e.root_slope())
     }
 
     fn frame_normal(&self, state: &State, surface: &Surface, frame: usize) -> FrameNormal {
@@ -262,7 +264,7 @@ impl<'a> Problem<'a> {
     fn frame_cost(&self, state: &State, surface: &Surface, frame: usize) -> f64 {
         let posed = state.posed(self.curve, surface, frame);
         let squares = self.frozen[frame].iter().filter(|f| f.weight > 0.0).map(|f| {
-            let r = f.metres_per_root * (posed.surface.root_among(&f.near, &f.x) - SKIN.sqrt());
+            let (r, _) = f.at(posed.surface.root_among(&f.near, &f.x));
             0.5 * f.weight * r * r
         });
         let points: f64 = squares.sum();
@@ -279,6 +281,13 @@ impl<'a> Problem<'a> {
             0.5 * SUNKEN_WEIGHT * sunken_m(self.known, &p.centre, p.semi_axes.y).max(0.0).powi(2)
         });
         points + outside.sum::<f64>() + sunken.sum::<f64>()
+    }
+
+    /// What priors and smoothness alone cost.
+    pub fn prior_cost(&self, state: &State) -> f64 {
+        let shared: f64 = self.shared_priors(state).iter().map(|(_, r, _)| r * r).sum();
+        let local: f64 = self.local_priors(state).iter().map(|(r, _)| r * r).sum();
+        0.5 * (shared + local)
     }
 
     /// Residuals of the shared priors: index into z, value, derivative.
@@ -429,9 +438,7 @@ impl ArrowProblem for Problem<'_> {
     fn cost(&self, state: &State) -> f64 {
         let surface = Surface::new(&state.shape);
         let frames: Vec<f64> = (0..self.frames.len()).into_par_iter().map(|t| self.frame_cost(state, &surface, t)).collect();
-        let shared: f64 = self.shared_priors(state).iter().map(|(_, r, _)| r * r).sum();
-        let local: f64 = self.local_priors(state).iter().map(|(r, _)| r * r).sum();
-        frames.iter().sum::<f64>() + 0.5 * (shared + local)
+        frames.iter().sum::<f64>() + self.prior_cost(state)
     }
 
     fn linearise(&self, state: &State) -> NormalEquations {
@@ -476,6 +483,7 @@ pub(super) mod tests {
     use crate::math::rotation::exp;
 
     pub const SETTINGS: Settings = Settings {
+        residual: PointResidual::Distance,
         model_m: 0.03,
         point_weight: 0.1,
         ray_weight: 0.1,
@@ -571,11 +579,17 @@ pub(super) mod tests {
 
     #[test]
     fn rows_of_every_residual_match_central_differences() {
+        [PointResidual::Distance, PointResidual::Ray, PointResidual::Field].into_iter().for_each(rows_match_central_differences);
+    }
+
+    fn rows_match_central_differences(residual: PointResidual) {
         let model = made_up_model(3);
         let curve = Curve::new(&model, 3);
         let state = state();
         let frames = frames(&curve, &state);
-        let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
+        let settings = Settings { residual, ..SETTINGS };
+        let problem = Problem::new(&curve, &frames, &settings, ALL, &KNOWN, &state);
+        assert_eq!(problem.frozen.iter().flatten().any(|f| f.offset_m.abs() > 1e-3), residual == PointResidual::Ray);
         let layout = state.layout();
         let motion = state.motion(&curve, &Surface::new(&state.shape), 1);
         for frozen in &problem.frozen[1] {
@@ -595,7 +609,7 @@ pub(super) mod tests {
                     let moved = state.moved(&y, &z);
                     let mut evaluation = Evaluation::default();
                     moved.posed(&curve, &Surface::new(&moved.shape), 1).surface.evaluate_among(&frozen.near, &frozen.x, &mut evaluation);
-                    frozen.metres_per_root * (evaluation.root() - SKIN.sqrt())
+                    frozen.at(evaluation.root()).0
                 };
                 let numeric = (at(1e-6) - at(-1e-6)) / 2e-6;
                 assert!((numeric - analytic).abs() < 1e-6 * (1.0 + numeric.abs()), "unknown {i}: {numeric} against {analytic}");

@@ -48,6 +48,13 @@ pub struct Track {
     up: Vector3<f64>,
 }
 
+impl Track {
+    /// The track on some of its frames.
+    pub fn at(&self, frames: &[usize]) -> Track {
+        Track { positions: frames.iter().map(|t| self.positions[*t]).collect(), ..self.clone() }
+    }
+}
+
 /// A start for the solver and the robust cost of the mean motion there.
 #[derive(Clone, Debug)]
 pub struct Hypothesis {

@@ -1,7 +1,9 @@
 //! What each measurement counts: Cauchy weights over variances along the normal, gates, and how well a state explains all.
 //!
 //! ω = base / ((nᵀ Σ n + σ²) (1 + (r/cσ)²)). Weights, κ and the points of rays are frozen for one solver run.
-//! Checked against a dense search (rays); the weights enter the Jacobian tests of `problem`.
+//! A cloud point counts with its distance to the skin; as [`PointResidual::Ray`] with how far it lies along its line of sight d
+//! behind where that meets the front of the body, y, with normal n: r = t nᵀd + κ (√d_eff(y) − √d_0), y and t frozen.
+//! Checked against a dense search (rays, lines of sight); the weights enter the Jacobian tests of `problem`.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -9,7 +11,7 @@ use rayon::prelude::*;
 use super::curve::Curve;
 use super::problem::{Frame, Known, Outside, Settings, Target};
 use super::state::State;
-use crate::body::surface::{Evaluation, Near};
+use crate::body::surface::{Evaluation, Near, SKIN};
 use crate::body::{PosedSurface, Surface};
 
 /// Frozen quantities of one target.
@@ -31,6 +33,35 @@ pub struct Frozen {
     /// Node that the skin there belongs to.
     pub node: u8,
     pub is_point: bool,
+    pub residual: PointResidual,
+    /// Added to the residual at `x`, metres.
+    pub offset_m: f64,
+}
+
+impl Frozen {
+    /// Residual where √d_eff at `x` is `root`, metres, and its derivative for it.
+    pub fn at(&self, root: f64) -> (f64, f64) {
+        let (value, slope) = match self.residual {
+            PointResidual::Field => {
+                let field = (-2.0 * root * root).exp();
+                ((0.5 - field) / (2.0 * SKIN.sqrt()), 2.0 * root * field / SKIN.sqrt())
+            }
+            PointResidual::Distance | PointResidual::Ray => (root - SKIN.sqrt(), 1.0),
+        };
+        (self.offset_m + self.metres_per_root * value, self.metres_per_root * slope)
+    }
+}
+
+/// What of a cloud point is made small.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum PointResidual {
+    /// Its distance to the skin.
+    #[default]
+    Distance,
+    /// Its distance along the line of sight to the front of the body; to the skin where that misses the body.
+    Ray,
+    /// T − F of the paper, as metres at the skin: it saturates away from it.
+    Field,
 }
 
 /// Frozen quantities of one primitive in one silhouette's picture.
@@ -84,9 +115,15 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
     let mut evaluation = Evaluation::default();
     let mut fitness = Fitness::default();
     let frozen = frame.targets.iter().map(|target| {
-        let (x, base) = match target {
-            Target::Point { x, .. } => (*x, settings.point_weight),
-            Target::Ray { origin, direction, .. } => (closest_on_ray(surface, origin, direction, &mut evaluation), settings.ray_weight),
+        let (x, deeper_m, base) = match target {
+            Target::Point { x, .. } if settings.residual == PointResidual::Ray => {
+                let y = front(surface, &known.viewpoint, x, &mut evaluation);
+                (y, (x - known.viewpoint).norm() - (y - known.viewpoint).norm(), settings.point_weight)
+            }
+            Target::Point { x, .. } => (*x, 0.0, settings.point_weight),
+            Target::Ray { origin, direction, .. } => {
+                (closest_on_ray(surface, origin, direction, &mut evaluation), 0.0, settings.ray_weight)
+            }
         };
         let near = surface.near(&x, MARGIN, &mut evaluation);
         surface.evaluate_among(&near, &x, &mut evaluation);
@@ -98,29 +135,32 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
             Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), near_floor(known, &x)),
         };
         let precision = 1.0 / (variance + settings.model_m * settings.model_m);
-        let behind = hidden && matches!(target, Target::Point { .. });
-        let distance = evaluation.distance().abs() + if behind { BEHIND_M } else { 0.0 };
+        let is_point = matches!(target, Target::Point { .. });
+        let behind = hidden && is_point;
+        let nearest = evaluation.shares.iter().min_by(|a, b| a.unit.norm_squared().total_cmp(&b.unit.norm_squared()));
+        let frozen = Frozen {
+            x,
+            near,
+            metres_per_root: evaluation.metres_per_root(),
+            sigma_m: precision.sqrt().recip(),
+            variance,
+            node: nearest.map_or(0, |share| surface.primitives[share.primitive].node as u8),
+            is_point,
+            residual: if is_point { settings.residual } else { PointResidual::Distance },
+            offset_m: deeper_m * normal.dot(&(x - known.viewpoint).normalize()),
+            ..Frozen::default()
+        };
+        let distance_m = frozen.at(evaluation.root()).0;
+        let distance = distance_m.abs() + if behind { BEHIND_M } else { 0.0 };
         let scaled = distance * distance * precision / (CAUCHY * CAUCHY);
         let robust = if hidden { 0.0 } else { 1.0 / (1.0 + scaled) };
         fitness.cost += base * 0.5 * CAUCHY * CAUCHY * scaled.ln_1p();
         fitness.effective += base * robust;
-        if distance * distance * precision < 9.0 && matches!(target, Target::Point { .. }) {
+        if distance * distance * precision < 9.0 && is_point {
             fitness.inliers += 1;
             fitness.inlier_square += distance * distance;
         }
-        let nearest = evaluation.shares.iter().min_by(|a, b| a.unit.norm_squared().total_cmp(&b.unit.norm_squared()));
-        Frozen {
-            x,
-            near,
-            weight: base * robust * precision,
-            metres_per_root: evaluation.metres_per_root(),
-            distance_m: evaluation.distance(),
-            sigma_m: precision.sqrt().recip(),
-            variance,
-            robust,
-            node: nearest.map_or(0, |share| surface.primitives[share.primitive].node as u8),
-            is_point: matches!(target, Target::Point { .. }),
-        }
+        Frozen { weight: base * robust * precision, distance_m, robust, ..frozen }
     });
     (frozen.collect(), fitness)
 }
@@ -162,6 +202,29 @@ pub fn total(fitness: &[Fitness]) -> Fitness {
     fitness.iter().fold(Fitness::default(), |sum, f| sum.add(*f))
 }
 
+/// Steps from within the body to its front, metres, and halvings of the last one: to a hundredth of a millimetre.
+const TO_FRONT_M: f64 = 0.04;
+const HALVINGS: usize = 12;
+
+/// Where the line of sight from `eye` to `x` first meets the skin; its point nearest to the skin where it misses.
+fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
+    let direction = (x - eye).normalize();
+    let (near, places) = surface.near_line(eye, &direction, MARGIN, CANDIDATES, evaluation);
+    let inside = |along: f64| surface.root_among(&near, &(eye + direction * along)) < SKIN.sqrt();
+    let Some(mut within) = places.filter(|along| inside(*along)).reduce(f64::min) else {
+        return closest_on_ray(surface, eye, &direction, evaluation);
+    };
+    while within > TO_FRONT_M && inside(within - TO_FRONT_M) {
+        within -= TO_FRONT_M;
+    }
+    let mut outside = within - TO_FRONT_M;
+    for _ in 0..HALVINGS {
+        let middle = 0.5 * (outside + within);
+        if inside(middle) { within = middle } else { outside = middle }
+    }
+    eye + direction * (0.5 * (outside + within))
+}
+
 /// The point of a ray nearest to the skin: least d_eff among the closest approaches to the primitives, then refined.
 fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
     let (near, places) = surface.near_line(origin, direction, MARGIN, CANDIDATES, evaluation);
@@ -188,7 +251,7 @@ fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vec
 mod tests {
     use super::*;
     use crate::fit::curve::tests::made_up_model;
-    use crate::fit::problem::tests::{frames, state};
+    use crate::fit::problem::tests::{KNOWN, SETTINGS, frames, state};
 
     #[test]
     fn ray_point_is_the_least_of_a_dense_search() {
@@ -202,6 +265,51 @@ mod tests {
                 let dense =
                     (0..8000).map(|i| surface.evaluate(&(origin + direction * (i as f64 * 1e-3))).d_eff).fold(f64::INFINITY, f64::min);
                 assert!(surface.evaluate(&found).d_eff < dense + 0.02, "{} {dense}", surface.evaluate(&found).d_eff);
+            }
+        }
+    }
+
+    #[test]
+    fn front_is_the_first_skin_of_a_dense_search() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let surface = state.posed(&curve, &Surface::new(&state.shape), 0).surface;
+        let (eye, mut met) = (KNOWN.viewpoint, 0);
+        for p in &surface.primitives {
+            let direction = (p.centre - eye).normalize();
+            let root = |along: f64| surface.evaluate(&(eye + direction * along)).root();
+            let dense = (4000..8000).map(|i| i as f64 * 5e-4).find(|along| root(*along) < SKIN.sqrt());
+            let found = (front(&surface, &eye, &(eye + direction), &mut Evaluation::default()) - eye).norm();
+            // Fields of primitives beside the line, which it leaves out, move the skin by less than a millimetre.
+            if let Some(first) = dense {
+                assert!((found - first).abs() < 1e-3, "{found} {first}");
+                met += 1;
+            }
+        }
+        assert!(met > surface.primitives.len() / 2, "{met}");
+    }
+
+    #[test]
+    fn just_before_the_front_distance_and_line_of_sight_agree() {
+        let model = made_up_model(3);
+        let curve = Curve::new(&model, 3);
+        let state = state();
+        let surface = state.posed(&curve, &Surface::new(&state.shape), 0).surface;
+        let eye = KNOWN.viewpoint;
+        let mut targets = Vec::new();
+        for p in &surface.primitives {
+            let y = front(&surface, &eye, &p.centre, &mut Evaluation::default());
+            let normal = surface.gradient(&y).normalize();
+            if surface.distance(&y).abs() < 1e-3 && normal.dot(&(y - eye).normalize()) < -0.7 {
+                targets.push(Target::Point { x: y + normal * 0.004, covariance: nalgebra::Matrix3::zeros() });
+            }
+        }
+        assert!(targets.len() > 5, "{}", targets.len());
+        let frame = Frame { targets, ..Frame::default() };
+        for residual in [PointResidual::Distance, PointResidual::Ray, PointResidual::Field] {
+            for frozen in freeze(&frame, &surface, &Settings { residual, ..SETTINGS }, &KNOWN).0 {
+                assert!((frozen.distance_m - 0.004).abs() < 1.5e-3, "{residual:?}: {}", frozen.distance_m);
             }
         }
     }

@@ -105,6 +105,8 @@ mod tests {
             curve,
             uncertainty,
             frames: Vec::new(),
+            model: 0,
+            candidates: Vec::new(),
             hypotheses: [1.0, 2.0],
             iterations: 0,
             speed_m_s: 1.2,

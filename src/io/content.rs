@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use super::calib_toml;
 use super::images::is_image_name;
 use super::session::{file_name, list};
-use super::session_config::{DEFAULT_ACTIVITY, SessionConfig};
+use super::session_config::SessionConfig;
 use super::status_json::Key;
 use super::video::is_video_name;
 
@@ -26,8 +26,10 @@ pub fn key(session: &Path, config: &Result<SessionConfig, String>, program: &str
 }
 
 fn model_hash(config: &SessionConfig) -> String {
-    let embedded = || format!("embedded {}", config.activity.unwrap_or(DEFAULT_ACTIVITY));
-    config.model.as_ref().map_or_else(embedded, |path| file_hash(path))
+    if config.model.is_empty() {
+        return config.activity.map_or("embedded".into(), |activity| format!("embedded {activity}"));
+    }
+    config.model.iter().map(|path| file_hash(path)).collect::<Vec<_>>().join(" ")
 }
 
 /// What identifies the program: its version, and as long as versions are rare the executable itself.
@@ -75,8 +77,9 @@ fn file_hash(path: &Path) -> String {
 }
 
 fn options_hash(config: &SessionConfig) -> String {
-    // The model counts by its content; its name stands in fit.json.
-    let named = SessionConfig { model: config.model.as_ref().and_then(|m| m.file_name()).map(PathBuf::from), ..config.clone() };
+    // Models count by their content; their names stand in fit.json.
+    let names = config.model.iter().filter_map(|m| m.file_name()).map(PathBuf::from).collect();
+    let named = SessionConfig { model: names, ..config.clone() };
     let text = serde_json::to_string(&named).unwrap_or_default();
     blake3::hash(text.as_bytes()).to_hex().to_string()
 }
@@ -131,11 +134,11 @@ mod tests {
         let folder = session();
         let keyed = |config: &SessionConfig| key(folder.path(), &Ok(config.clone()), "1");
         let start = keyed(&SessionConfig::default());
-        assert_eq!(start.model_hash, "embedded walking");
+        assert_eq!(start.model_hash, "embedded");
         assert_ne!(keyed(&SessionConfig { fps: Some(25.0), ..Default::default() }).options_hash, start.options_hash);
         let model = folder.path().join("m.npz");
         fs::write(&model, "a").unwrap();
-        let config = SessionConfig { model: Some(model.clone()), ..Default::default() };
+        let config = SessionConfig { model: vec![model.clone()], ..Default::default() };
         let first = keyed(&config);
         fs::write(&model, "b").unwrap();
         let second = keyed(&config);

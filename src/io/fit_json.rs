@@ -9,6 +9,15 @@ use super::write_atomic;
 use crate::body::Length;
 use crate::fit::state::{DEVIATING, LOCAL};
 use crate::fit::{Fit, Observation, weighing::total};
+use crate::motion_model::Activity;
+
+/// A model as it is named in reports.
+#[derive(Clone, Debug, Serialize)]
+pub struct ModelName {
+    pub model: String,
+    pub model_hash: String,
+    pub activity: Activity,
+}
 
 /// Fewer inlying points than this leave a frame to its neighbours.
 const FEW_POINTS: usize = 40;
@@ -16,8 +25,10 @@ const FEW_POINTS: usize = 40;
 #[derive(Serialize)]
 struct FitReport<'a> {
     software: &'static str,
-    model: &'a str,
-    model_hash: &'a str,
+    #[serde(flatten)]
+    model: &'a ModelName,
+    /// What every model cost, on few frames and with priors, where several were given.
+    candidates: Vec<CandidateReport<'a>>,
     components: usize,
     iterations: u64,
     /// Robust cost, without priors.
@@ -50,6 +61,14 @@ struct FitReport<'a> {
 }
 
 #[derive(Serialize)]
+struct CandidateReport<'a> {
+    #[serde(flatten)]
+    model: &'a ModelName,
+    /// Of its better half-cycle and of the other one.
+    costs: [f64; 2],
+}
+
+#[derive(Serialize)]
 struct FrameReport {
     frame: usize,
     time_s: f64,
@@ -63,8 +82,8 @@ struct FrameReport {
     heading_sigma_deg: f64,
 }
 
-/// Writes the report of `fit`, made with the model file `model` of content hash `model_hash`.
-pub fn write(path: &Path, fit: &Fit, observations: &[Observation], model: &str, model_hash: &str) -> std::io::Result<()> {
+/// Writes the report of `fit`, for which these models were given.
+pub fn write(path: &Path, fit: &Fit, observations: &[Observation], models: &[ModelName]) -> std::io::Result<()> {
     let sum = total(&fit.frames);
     let layout = fit.state.layout();
     let sigma = |i: usize| fit.shared_variance(i).sqrt();
@@ -74,8 +93,8 @@ pub fn write(path: &Path, fit: &Fit, observations: &[Observation], model: &str, 
     let shape = fit.shape();
     let report = FitReport {
         software: concat!("muybridge ", env!("CARGO_PKG_VERSION")),
-        model,
-        model_hash,
+        model: &models[fit.model],
+        candidates: models.iter().zip(&fit.candidates).map(|(model, c)| CandidateReport { model, costs: c.costs }).collect(),
         components: fit.state.weights.len(),
         iterations: fit.iterations,
         cost: sum.cost,

@@ -2,8 +2,9 @@
 //!
 //! ```toml
 //! fps = 50                   # frames per second of pictures, which do not say it themselves
-//! model = "walking.npz"      # of `muybridge model build`; a relative path is relative to this file
-//! activity = "running"       # or an embedded model; not both in one file
+//! model = "walking.npz"      # of `muybridge model build`, or a list of such files of which the best one is taken; a relative path
+//!                            # is relative to this file
+//! activity = "running"       # or an embedded model; not both in one file; with neither all embedded ones are tried
 //! variance = 0.95            # part of the model's variance that the last stage of the fit uses
 //! pictures = true            # also draw the result
 //! ```
@@ -13,7 +14,8 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::calib_toml::toml_message;
 use super::session::SessionError;
@@ -21,16 +23,14 @@ use crate::motion_model::Activity;
 
 pub const FILE: &str = "muybridge.toml";
 
-/// What people do where nothing says it.
-pub const DEFAULT_ACTIVITY: Activity = Activity::Walking;
-
 /// Options in force for a session; `None` is the command's own choice.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SessionConfig {
     pub fps: Option<f64>,
-    /// Absolute once read.
-    pub model: Option<PathBuf>,
+    /// Absolute once read; of several models the one that explains the footage best is taken.
+    #[serde(deserialize_with = "one_or_more")]
+    pub model: Vec<PathBuf>,
     pub activity: Option<Activity>,
     /// Above 0, at most 1.
     pub variance: Option<f64>,
@@ -40,7 +40,7 @@ pub struct SessionConfig {
 impl SessionConfig {
     /// What stands here, and where nothing does what stands in `farther`.
     pub fn or(self, farther: SessionConfig) -> SessionConfig {
-        let chosen = self.model.is_some() || self.activity.is_some();
+        let chosen = !self.model.is_empty() || self.activity.is_some();
         let (model, activity) = if chosen { (self.model, self.activity) } else { (farther.model, farther.activity) };
         SessionConfig {
             fps: self.fps.or(farther.fps),
@@ -63,14 +63,29 @@ fn read_file(path: &Path) -> Result<SessionConfig, SessionError> {
     let text = std::fs::read_to_string(path).map_err(|error| SessionError::Read { path: path.into(), error })?;
     let refused = |message| SessionError::Config { path: path.into(), message };
     let found: SessionConfig = toml::from_str(&text).map_err(|e| refused(toml_message(&text, &e)))?;
-    if found.model.is_some() && found.activity.is_some() {
+    if !found.model.is_empty() && found.activity.is_some() {
         return Err(refused("model and activity exclude each other; a model file has its own activity".into()));
     }
     if found.variance.is_some_and(|v| !(v > 0.0 && v <= 1.0)) {
         return Err(refused("variance must be above 0 and at most 1".into()));
     }
-    let model = found.model.as_ref().map(|model| path.parent().unwrap_or(Path::new("/")).join(model));
+    let model = found.model.iter().map(|model| path.parent().unwrap_or(Path::new("/")).join(model)).collect();
     Ok(SessionConfig { model, ..found })
+}
+
+/// A path or a list of paths.
+fn one_or_more<'de, D: Deserializer<'de>>(value: D) -> Result<Vec<PathBuf>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "model must be a file or a list of files")]
+    enum Files {
+        One(PathBuf),
+        Several(Vec<PathBuf>),
+    }
+    match Files::deserialize(value)? {
+        Files::One(path) => Ok(vec![path]),
+        Files::Several(paths) if paths.is_empty() => Err(D::Error::custom("model is an empty list; name a file, or leave it out")),
+        Files::Several(paths) => Ok(paths),
+    }
 }
 
 #[cfg(test)]
@@ -86,9 +101,8 @@ mod tests {
             fs::create_dir(folder).unwrap();
             fs::write(folder.join(FILE), text).unwrap();
         }
-        let relative =
-            |c: SessionConfig| SessionConfig { model: c.model.map(|m| m.strip_prefix(place.path()).unwrap().to_path_buf()), ..c };
-        read(&folders[2]).map(relative).map_err(|e| e.to_string())
+        let relative = |m: &PathBuf| m.strip_prefix(place.path()).unwrap().to_path_buf();
+        read(&folders[2]).map(|c| SessionConfig { model: c.model.iter().map(relative).collect(), ..c }).map_err(|e| e.to_string())
     }
 
     #[test]
@@ -96,7 +110,7 @@ mod tests {
         let read = read_levels(["fps = 25\npictures = true\nmodel = \"models/a.npz\"", "fps = 50\nvariance = 0.9", "pictures = false"]);
         let expected = SessionConfig {
             fps: Some(50.0),
-            model: Some("study/models/a.npz".into()),
+            model: vec!["study/models/a.npz".into()],
             activity: None,
             variance: Some(0.9),
             pictures: Some(false),
@@ -107,15 +121,19 @@ mod tests {
     #[test]
     fn model_and_activity_are_one_choice() {
         let nearer = read_levels(["model = \"a.npz\"", "activity = \"jumping\"", ""]).unwrap();
-        assert_eq!((nearer.model, nearer.activity), (None, Some(Activity::Jumping)));
+        assert_eq!((nearer.model, nearer.activity), (vec![], Some(Activity::Jumping)));
         let nearer = read_levels(["activity = \"jumping\"", "", "model = \"a.npz\""]).unwrap();
-        assert_eq!((nearer.model, nearer.activity), (Some("study/group/walk/a.npz".into()), None));
+        assert_eq!((nearer.model, nearer.activity), (vec!["study/group/walk/a.npz".into()], None));
+        let nearer = read_levels(["activity = \"jumping\"", "model = [\"a.npz\", \"../b.npz\"]", ""]).unwrap();
+        assert_eq!((nearer.model, nearer.activity), (vec!["study/group/a.npz".into(), "study/group/../b.npz".into()], None));
     }
 
     #[test]
     fn what_cannot_be_meant_is_refused_with_its_file() {
         for (text, message) in [
             ("model = \"a.npz\"\nactivity = \"walking\"", "exclude each other"),
+            ("model = []", "line 1: model is an empty list"),
+            ("model = 3", "line 1: model must be a file or a list of files"),
             ("variance = 0.0", "variance must be above 0"),
             ("variance = nan", "variance must be above 0"),
             ("activity = \"swimming\"", "line 1: unknown variant `swimming`"),

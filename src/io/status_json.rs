@@ -70,7 +70,7 @@ pub struct Key {
     pub inputs_hash: String,
     /// Of the options in force, from whichever `muybridge.toml` they come.
     pub options_hash: String,
-    /// Of the model file's bytes; `embedded walking` and so on for the models of the program.
+    /// Of the model file's bytes; `embedded` for all models of the program, `embedded walking` and so on for one.
     pub model_hash: String,
     /// Of the program: its version and the first digits of its executable's hash.
     pub version: String,

@@ -20,6 +20,8 @@ pub enum Activity {
 }
 
 impl Activity {
+    pub const ALL: [Activity; 3] = [Activity::Walking, Activity::Running, Activity::Jumping];
+
     /// Walking and running repeat; a jump has a start and an end.
     pub fn is_cyclic(self) -> bool {
         self != Activity::Jumping

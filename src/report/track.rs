@@ -9,6 +9,7 @@ use super::page::{Grade, Section, Verdict, facts, page, picture, png_uri, table,
 use super::walk::Walk;
 use super::{CloudDot, ReportError, cloud_and_body, person, person_depth, style_charts, track_charts, view3d, walk};
 use crate::body::{Joint, NODES, Placement, PosedSurface, Surface, place};
+use crate::fit::contest::runner_up;
 use crate::fit::{Fit, Observation};
 use crate::io::joints_csv;
 use crate::motion_model::Model;
@@ -36,6 +37,8 @@ pub struct TrackReport<'a> {
     pub model: &'a Model,
     pub model_name: &'a str,
     pub model_hash: &'a str,
+    /// Names of all models that were given.
+    pub given: &'a [&'a str],
     pub fit: &'a Fit,
     pub observations: &'a [Observation],
     /// Index of a frame, and the pictures of all cameras.
@@ -98,6 +101,15 @@ impl TrackReport<'_> {
             notes.push(format!(
                 "Left and right may be exchanged: with the legs swapped the cost is {other:.0} against {best:.0}. Look at the pictures."
             ));
+        }
+        if let Some(second) = runner_up(&fit.candidates) {
+            let [best, other] = [fit.model, second].map(|k| fit.candidates[k].costs[0]);
+            if other < UNDECIDED * best {
+                notes.push(format!(
+                    "The model may be the wrong one: {} costs {other:.0} against {best:.0} for {}. Name the right one.",
+                    self.given[second], self.model_name
+                ));
+            }
         }
         let few = self.left_to_neighbours();
         if few.len() as f64 > UNSEEN_SHARE * self.observations.len() as f64 {
@@ -212,6 +224,14 @@ impl TrackReport<'_> {
         Some(joints[..5].iter().map(|(name, m)| vec![name.to_string(), format!("{:.1}", 1e3 * m)]).collect())
     }
 
+    /// Every model with its costs, best first.
+    fn candidates(&self) -> String {
+        let mut all: Vec<_> = self.given.iter().zip(&self.fit.candidates).map(|(name, c)| (c.costs, name)).collect();
+        all.sort_by(|a, b| a.0[0].total_cmp(&b.0[0]));
+        let each: Vec<String> = all.iter().map(|([best, other], name)| format!("{name} {best:.0} ({other:.0})")).collect();
+        if each.is_empty() { "none, one model was given".into() } else { each.join(", ") }
+    }
+
     fn facts(&self) -> Markup {
         let (fit, shape) = (self.fit, self.fit.shape());
         let sigma = shape.stature_m * fit.shared_variance(fit.state.layout().stature()).sqrt();
@@ -234,6 +254,7 @@ impl TrackReport<'_> {
                 ),
             ),
             ("model's hash", self.model_hash.to_string()),
+            ("models that competed, with their costs and those of the other half-cycle", self.candidates()),
             (
                 "body",
                 format!("stature {:.3} m (standard deviation {sigma:.3}), hip joints at {:.3} m", shape.stature_m, shape.hip_height_m()),

@@ -76,7 +76,7 @@ pub fn run(args: &CoverageArgs) -> Result<()> {
         let person = Person::draw(&model, options.components, &rig, repeat % args.people);
         let sight = SightOptions { seed: 1000 + repeat, disparity_px: args.disparity_noise, ..SightOptions::default() };
         let take = person.film(rig, &sight)?;
-        let fit = fitted(&take, &model, &options)?;
+        let fit = fitted(&take, &[&model], &options)?;
         scores.add(&person, &take, &fit).with_context(|| format!("repeat {repeat}"))?;
         if let Some(u) = &fit.uncertainty {
             shares.push(u.shares);
@@ -138,6 +138,7 @@ impl Person {
     fn film(&self, rig: Rig, sight: &SightOptions) -> Result<Take> {
         let frames: Vec<(usize, f64)> = (0..FRAMES).map(|k| (k, k as f64 / FPS)).collect();
         Ok(Take {
+            activity: Activity::Walking,
             observations: observe(&rig, &self.state.shape, &frames, &self.poses, sight)?,
             truth: positions(&self.state.shape, &self.poses),
             phases: self.state.carriers.iter().map(|c| c.phase).collect(),

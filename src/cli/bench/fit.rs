@@ -9,7 +9,7 @@ use anyhow::{Context, Result, ensure};
 use clap::Args;
 use muybridge::body::{NODES, place};
 use muybridge::clouds::{CloudOptions, CloudRig};
-use muybridge::fit::{self, Fit, FitOptions, Observation};
+use muybridge::fit::{self, Fit, FitOptions, Observation, PointResidual};
 use muybridge::io::{joints_csv, model_npz::read_model, session::Session};
 use muybridge::motion_model::{Activity, Model};
 use muybridge::phantom::{joint_errors, truth};
@@ -51,6 +51,8 @@ fn variants() -> Vec<Variant> {
         of("10 weights", FitOptions { components: 10, ..whole }),
         of("30 weights", FitOptions { components: 30, ..whole }),
         of("no turns of single joints", FitOptions { deviations: false, ..whole }),
+        of("points along lines of sight", FitOptions { residual: PointResidual::Ray, ..whole }),
+        of("T - F of the paper", FitOptions { residual: PointResidual::Field, ..whole }),
         of("10 weights, no turns", FitOptions { components: 10, deviations: false, ..whole }),
     ]
 }
@@ -109,7 +111,7 @@ fn fitted(seen: &Seen, model: &Model, variant: &Variant) -> Result<Fit> {
     if !variant.silhouettes {
         observations.iter_mut().flat_map(|o| &mut o.masks).for_each(|mask| *mask = None);
     }
-    Ok(fit::fit(&observations, &seen.rig, model, seen.floor_m, &variant.options, &|_| !interrupt::came())?)
+    Ok(fit::fit(&observations, &seen.rig, &[model], seen.floor_m, &variant.options, &|_| !interrupt::came())?)
 }
 
 fn row(fit: &Fit, seen: &Seen, known: &joints_csv::Joints) -> Result<String> {

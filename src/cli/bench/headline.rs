@@ -189,7 +189,7 @@ impl<'a> Person<'a> {
     fn sight(&self, args: &HeadlineArgs, rig: &Rig, shape: &Shape, poses: &[Pose], options: &FitOptions) -> Result<Fit> {
         let frames: Vec<(usize, f64)> = (0..poses.len()).map(|i| (i, i as f64 / args.fps)).collect();
         let seen = observe(rig, shape, &frames, poses, &SightOptions::default())?;
-        Ok(fit::fit(&seen, rig, &self.others.model, Some(0.0), options, &|_| !interrupt::came())?)
+        Ok(fit::fit(&seen, rig, &[&self.others.model], Some(0.0), options, &|_| !interrupt::came())?)
     }
 
     fn film(&self, args: &HeadlineArgs, folder: &Path, rig: &Rig, shape: &Shape, poses: &[Pose], options: &FitOptions) -> Result<Fit> {
@@ -198,8 +198,8 @@ impl<'a> Person<'a> {
         write_session(&folder.join("session"), &Take { scene: &scene, rig, poses, fps: args.fps, depth_every: None })?;
         let (session, _) = Session::open(&folder.join("session"), None)?;
         let seen = track::look(&session, None, |_, _, _| Ok(()))?;
-        let tracked = track::fit_to(&session, seen, &self.others, options, None)?;
-        track::write(&folder.join("track"), &session, &self.others, &tracked)?;
+        let tracked = track::fit_to(&session, seen, std::slice::from_ref(&self.others), options, None)?;
+        track::write(&folder.join("track"), &session, std::slice::from_ref(&self.others), &tracked)?;
         Ok(tracked.fit)
     }
 

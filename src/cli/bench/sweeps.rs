@@ -45,9 +45,13 @@ enum Table {
 const STRANGERS: u64 = 1000;
 
 pub fn run(args: &SweepsArgs) -> Result<()> {
-    let model = NamedModel::synthetic(Activity::Walking)?.model;
+    let embedded = NamedModel::embedded()?;
+    let models: Vec<&Model> = embedded.iter().map(|m| &m.model).collect();
     let wanted = |table| args.only.is_empty() || args.only.contains(&table);
-    println!("phantom walks of 1.5 s at 1.3 m/s, people outside the model (embedded synthetic), mean of {} per row", args.people);
+    println!(
+        "phantom walks of 1.5 s at 1.3 m/s, people outside the models (embedded synthetic, all three compete), mean of {} per row",
+        args.people
+    );
     println!("{:<34}{:>10}{:>10}{:>8}", "", "joints mm", "legs deg", "right");
     let base = Walk::default();
     let sight = |sight: SightOptions| Walk { sight, ..Walk::default() };
@@ -79,25 +83,25 @@ pub fn run(args: &SweepsArgs) -> Result<()> {
         rows.push((Table::Heading, format!("heading {degrees} deg"), Walk { heading: Some(TAU * f64::from(k) / 8.0), ..base.clone() }));
     }
     for (_, name, walk) in rows.iter().filter(|(table, ..)| wanted(*table)) {
-        cell(name, walk, args.people, &model)?;
+        cell(name, walk, args.people, &models)?;
     }
     if wanted(Table::Activities) {
-        activities(args.people)?;
+        activities(args.people, &models)?;
     }
     if wanted(Table::Starts) {
-        starts(args.starts, &model)?;
+        starts(args.starts, &models)?;
     }
     Ok(())
 }
 
 /// One row: the walk by several people with noise of their own.
-fn cell(name: &str, walk: &Walk, people: u64, model: &Model) -> Result<()> {
+fn cell(name: &str, walk: &Walk, people: u64, models: &[&Model]) -> Result<()> {
     let mut scores = Vec::new();
     for k in 0..people {
         interrupt::check()?;
         let sight = SightOptions { seed: 1 + k, ..walk.sight };
         let take = Walk { subject: STRANGERS + k, begin: 0.37 * k as f64, sight, ..walk.clone() }.film()?;
-        scores.extend(score(&take, model, &FitOptions::default())?);
+        scores.extend(score(&take, models, &FitOptions::default())?);
     }
     let mean = |of: fn(&Score) -> f64| scores.iter().map(of).sum::<f64>() / scores.len() as f64;
     let right = scores.iter().filter(|s| s.right).count();
@@ -105,16 +109,14 @@ fn cell(name: &str, walk: &Walk, people: u64, model: &Model) -> Result<()> {
     Ok(())
 }
 
-fn activities(people: u64) -> Result<()> {
-    let running = NamedModel::synthetic(Activity::Running)?.model;
-    let jumping = NamedModel::synthetic(Activity::Jumping)?.model;
+fn activities(people: u64, models: &[&Model]) -> Result<()> {
     for speed in [2.2, 2.8, 3.3] {
         let run = Walk { activity: Activity::Running, parameter: speed, seconds: 1.2, ..Walk::default() };
-        cell(&format!("run at {speed} m/s"), &run, people, &running)?;
+        cell(&format!("run at {speed} m/s"), &run, people, models)?;
     }
     for length in [0.4, 0.8, 1.2] {
         let jump = Walk { activity: Activity::Jumping, parameter: length, seconds: 3.0, ..Walk::default() };
-        cell(&format!("jump of {:.0} cm", 100.0 * length), &jump, people, &jumping)?;
+        cell(&format!("jump of {:.0} cm", 100.0 * length), &jump, people, models)?;
     }
     Ok(())
 }
@@ -144,12 +146,12 @@ fn random_walk(seed: u64) -> Walk {
     }
 }
 
-fn starts(count: u64, model: &Model) -> Result<()> {
+fn starts(count: u64, models: &[&Model]) -> Result<()> {
     let (mut started, mut errors, mut angles) = (0, Vec::new(), Vec::new());
     for seed in 0..count {
         interrupt::check()?;
         let walk = random_walk(seed);
-        match walk.film().and_then(|take| score(&take, model, &FitOptions::default())) {
+        match walk.film().and_then(|take| score(&take, models, &FitOptions::default())) {
             Ok(Some(found)) => {
                 if found.started() {
                     started += 1;

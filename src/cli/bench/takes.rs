@@ -102,6 +102,7 @@ impl Default for Walk {
 
 /// What was seen, and what was so.
 pub struct Take {
+    pub activity: Activity,
     pub rig: Rig,
     pub observations: Vec<Observation>,
     pub truth: Vec<Positions>,
@@ -131,6 +132,7 @@ impl Walk {
         let frames: Vec<(usize, f64)> = kept.iter().map(|k| (*k, *k as f64 / self.fps)).collect();
         let seen: Vec<Pose> = kept.iter().map(|k| poses[*k].clone()).collect();
         Ok(Take {
+            activity: self.activity,
             observations: observe(&rig, &shape, &frames, &seen, &self.sight)?,
             truth: positions(&shape, &seen),
             phases: frames.iter().map(|(_, t)| (from_s + t) / cycle.duration_s).collect(),
@@ -167,24 +169,24 @@ pub struct Score {
     pub joints_mm: f64,
     /// Mean error of hips' and knees' included angles, degrees.
     pub legs_deg: f64,
-    /// Left is left, and the phase of a cycle is right to a quarter.
+    /// The model is one of what was done, left is left, and the phase of a cycle is right to a quarter.
     pub right: bool,
 }
 
 impl Score {
-    /// Right half-cycle and within six centimetres: a start that more iterations would only polish.
+    /// Right model, right half-cycle and within six centimetres: a start that more iterations would only polish.
     pub fn started(&self) -> bool {
         self.right && self.joints_mm < 60.0
     }
 }
 
-pub fn fitted(take: &Take, model: &Model, options: &FitOptions) -> Result<Fit, FitError> {
-    fit::fit(&take.observations, &take.rig, model, Some(take.floor_m), options, &|_| !interrupt::came())
+pub fn fitted(take: &Take, models: &[&Model], options: &FitOptions) -> Result<Fit, FitError> {
+    fit::fit(&take.observations, &take.rig, models, Some(take.floor_m), options, &|_| !interrupt::came())
 }
 
 /// Fit and score; `None` where the fit cannot begin.
-pub fn score(take: &Take, model: &Model, options: &FitOptions) -> Result<Option<Score>> {
-    let fit = match fitted(take, model, options) {
+pub fn score(take: &Take, models: &[&Model], options: &FitOptions) -> Result<Option<Score>> {
+    let fit = match fitted(take, models, options) {
         Ok(fit) => fit,
         Err(error @ FitError::Interrupted) => return Err(error.into()),
         Err(_) => return Ok(None),
@@ -195,6 +197,8 @@ pub fn score(take: &Take, model: &Model, options: &FitOptions) -> Result<Option<
     Ok(Some(Score {
         joints_mm: 1e3 * errors.absolute_m,
         legs_deg: 0.5 * (errors.angles[0] + errors.angles[1]).to_degrees(),
-        right: errors.swapped_over_straight > 1.0 && (apart.abs() < 0.25 || !model.activity.is_cyclic()),
+        right: models[fit.model].activity == take.activity
+            && errors.swapped_over_straight > 1.0
+            && (apart.abs() < 0.25 || !take.activity.is_cyclic()),
     }))
 }

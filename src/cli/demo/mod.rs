@@ -102,7 +102,7 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
     clock.time("render", || render(&session_folder, &rig, &truth))?;
     let (session, _) = Session::open(&session_folder, None)?;
     clock.time("check", || announce(&session))?;
-    let model = clock.time("model", || NamedModel::synthetic(Activity::Walking))?;
+    let models = clock.time("models", NamedModel::embedded)?;
     let seen = clock.time("clouds", || {
         track::look(&session, None, |_, frame, found| {
             if frame.number.is_multiple_of(CLOUD_EVERY) {
@@ -111,12 +111,13 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
             Ok(())
         })
     })?;
-    let tracked = clock.time("fit", || track::fit_to(&session, seen, &model, &FitOptions::default(), None))?;
-    let (style, generated) = clock.time("style and new speeds", || generate(folder, &session, &model, &tracked))?;
+    let tracked = clock.time("fit", || track::fit_to(&session, seen, &models, &FitOptions::default(), None))?;
+    let model = &models[tracked.fit.model];
+    let (style, generated) = clock.time("style and new speeds", || generate(folder, &session, &models, &tracked))?;
     let rows = clock.time("errors and pictures", || {
-        let rows = errors::rows(&truth, &model, &tracked, &style, &generated)?;
-        track::draw(&folder.join("pictures"), &session.rig, &model, &tracked)?;
-        pictures::draw(&folder.join("pictures"), &truth, &model, &tracked, &generated, tracked.depth.as_ref().map(|d| &d.1))?;
+        let rows = errors::rows(&truth, model, &tracked, &style, &generated)?;
+        track::draw(&folder.join("pictures"), &session.rig, model, &tracked)?;
+        pictures::draw(&folder.join("pictures"), &truth, model, &tracked, &generated, tracked.depth.as_ref().map(|d| &d.1))?;
         Ok(rows)
     })?;
     let text = table::text(&rows, errors::NOTES, &clock.0);
@@ -154,9 +155,10 @@ fn announce(session: &Session) -> Result<()> {
 }
 
 /// Writes what `track` and `generate` write; returns the tracked person's style and the motions made of it.
-fn generate(folder: &Path, session: &Session, model: &NamedModel, tracked: &Tracked) -> Result<(Style, Vec<Generated>)> {
-    track::write(&folder.join("track"), session, model, tracked)?;
-    track_report::write(&folder.join("track"), session, model, tracked)?;
+fn generate(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<(Style, Vec<Generated>)> {
+    track::write(&folder.join("track"), session, models, tracked)?;
+    track_report::write(&folder.join("track"), session, models, tracked)?;
+    let model = &models[tracked.fit.model];
     let style = track::style(&tracked.fit, model);
     let offsets = tracked.fit.shape().offsets();
     let one = |kmh: f64| {
