@@ -51,6 +51,8 @@ const FACING: f64 = 0.2;
 const MARGIN: f32 = 5.0;
 /// Primitives that a ray passes nearest to, tried as the start of its closest approach.
 const CANDIDATES: usize = 4;
+/// Newton steps from there.
+const STEPS: usize = 3;
 /// Outlines lower than this above the floor are those of contact shadows.
 const CONTACT_M: f64 = 0.06;
 /// Added to the distance of a point that only the far side of the body explains.
@@ -84,11 +86,13 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
     let mut evaluation = Evaluation::default();
     let mut fitness = Fitness::default();
     let frozen = frame.targets.iter().map(|target| {
-        let (x, base) = match target {
-            Target::Point { x, .. } => (*x, settings.point_weight),
-            Target::Ray { origin, direction, .. } => (closest_on_ray(surface, origin, direction, &mut evaluation), settings.ray_weight),
+        let (x, near, base) = match target {
+            Target::Point { x, .. } => (*x, surface.near(x, MARGIN, &mut evaluation), settings.point_weight),
+            Target::Ray { origin, direction, .. } => {
+                let (along, near) = surface.nearest_on_line(origin, direction, MARGIN, [CANDIDATES, STEPS], &mut evaluation);
+                (origin + direction * along, near, settings.ray_weight)
+            }
         };
-        let near = surface.near(&x, MARGIN, &mut evaluation);
         surface.evaluate_among(&near, &x, &mut evaluation);
         let normal = evaluation.gradient.normalize();
         let (variance, hidden) = match target {
@@ -162,28 +166,6 @@ pub fn total(fitness: &[Fitness]) -> Fitness {
     fitness.iter().fold(Fitness::default(), |sum, f| sum.add(*f))
 }
 
-/// The point of a ray nearest to the skin: least d_eff among the closest approaches to the primitives, then refined.
-fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
-    let (near, places) = surface.near_line(origin, direction, MARGIN, CANDIDATES, evaluation);
-    let mut best = (f64::INFINITY, 0.0);
-    for along in places {
-        surface.evaluate_among(&near, &(origin + direction * along), evaluation);
-        if evaluation.d_eff < best.0 {
-            best = (evaluation.d_eff, along);
-        }
-    }
-    // Near one primitive d_eff is a parabola along the ray; Newton steps with its curvature settle the blend.
-    let mut along = best.1;
-    for _ in 0..3 {
-        surface.evaluate_among(&near, &(origin + direction * along), evaluation);
-        let nearest = evaluation.shares.iter().min_by(|a, b| a.unit.norm_squared().total_cmp(&b.unit.norm_squared()));
-        let Some(p) = nearest.map(|share| &surface.primitives[share.primitive]) else { break };
-        let curvature = 2.0 * (p.unit_from_world * direction).norm_squared();
-        along -= (evaluation.gradient.dot(direction) / curvature).clamp(-0.03, 0.03);
-    }
-    origin + direction * along
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -198,7 +180,10 @@ mod tests {
         let surface = state.posed(&curve, &Surface::new(&state.shape), 0).surface;
         for target in &frames(&curve, &state)[0].targets {
             if let Target::Ray { origin, direction, .. } = target {
-                let found = closest_on_ray(&surface, origin, direction, &mut Evaluation::default());
+                let steps = [CANDIDATES, STEPS];
+                let (along, near) = surface.nearest_on_line(origin, direction, MARGIN, steps, &mut Evaluation::default());
+                let found = origin + direction * along;
+                assert!((surface.root_among(&near, &found) - surface.evaluate(&found).root()).abs() < 1e-4);
                 let dense =
                     (0..8000).map(|i| surface.evaluate(&(origin + direction * (i as f64 * 1e-3))).d_eff).fold(f64::INFINITY, f64::min);
                 assert!(surface.evaluate(&found).d_eff < dense + 0.02, "{} {dense}", surface.evaluate(&found).d_eff);
