@@ -84,7 +84,7 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
             number,
             time_s: number as f64 / fps,
             cloud: Cloud { points: points.map(point).collect() },
-            masks: sighting::masks(&figure, &rig, number, &sight).into_iter().map(Some).collect(),
+            masks: Arc::new(sighting::masks(&figure, &rig, number, &sight).into_iter().map(Some).collect()),
         }
     };
     let observations: Vec<Observation> = true_poses.par_iter().enumerate().map(observe).collect();
@@ -104,7 +104,7 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
     // Ten frames in which nothing was seen, and points that are no numbers.
     let mut gaps = observations.clone();
     for o in &mut gaps[9..19] {
-        (o.cloud, o.masks) = (Cloud::default(), vec![None; rig.cameras.len()]);
+        (o.cloud, o.masks) = (Cloud::default(), Arc::new(vec![None; rig.cameras.len()]));
     }
     let nowhere = CloudPoint { position: Vector3::repeat(f64::NAN), ..gaps[3].cloud.points[0].clone() };
     gaps[3].cloud.points.push(nowhere);

@@ -1,6 +1,7 @@
 //! A session's frames to what the fit looks at: clouds and silhouettes.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use muybridge::clouds::{CloudOptions, CloudRig, FrameCloud};
@@ -12,7 +13,7 @@ use rayon::prelude::*;
 
 use super::{interrupt, progress};
 
-/// Frames that are in memory at once.
+/// Frames that are looked at together; twice as many are in memory.
 const BATCH: usize = 8;
 
 /// Clouds of all frames; `each` sees every frame with its pictures, in order. What stereo finds is kept in the folder `kept`
@@ -28,24 +29,23 @@ pub fn observe(
     let bar = progress::bar("clouds", session.frame_count as u64);
     let mut observations = Vec::with_capacity(session.frame_count);
     let mut frames = session.frames();
-    loop {
-        let batch: Vec<FrameSet> = frames.by_ref().take(BATCH).collect::<Result<_, _>>()?;
-        if batch.is_empty() {
-            break;
-        }
-        let clouds: Vec<FrameCloud> = batch
-            .par_iter()
-            .map(|frame| {
-                interrupt::check()?;
-                let cloud = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
-                bar.inc(1);
-                cloud
-            })
-            .collect::<Result<_>>()?;
-        for (frame, cloud) in batch.iter().zip(clouds) {
+    let mut read = || frames.by_ref().take(BATCH).collect::<Result<Vec<FrameSet>, _>>();
+    let mut batch = read()?;
+    while !batch.is_empty() {
+        let of_frame = |frame: &FrameSet| {
+            interrupt::check()?;
+            let cloud = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
+            bar.inc(1);
+            cloud
+        };
+        // The next pictures are read meanwhile.
+        let (next, clouds) = rayon::join(&mut read, || batch.par_iter().map(of_frame).collect::<Result<Vec<FrameCloud>>>());
+        for (frame, cloud) in batch.iter().zip(clouds?) {
             each(frame, &cloud)?;
-            observations.push(Observation { number: frame.number, time_s: frame.time_s, cloud: cloud.cloud, masks: cloud.masks });
+            let (number, time_s, masks) = (frame.number, frame.time_s, Arc::new(cloud.masks));
+            observations.push(Observation { number, time_s, cloud: cloud.cloud, masks });
         }
+        batch = next?;
     }
     bar.finish();
     if observations.iter().all(|o| o.cloud.points.is_empty()) {
