@@ -123,6 +123,10 @@ pub const SETTINGS: Settings = Settings {
 /// A second person in more than one of so many frames is one too many.
 const CROWDED: usize = 4;
 
+/// Between frames of the rough stages: two frames of usual footage, in which legs turn by a few degrees.
+const ROUGH_STEP_S: f64 = 1.0 / 15.0;
+/// Fewer frames are looked at all.
+const ROUGH_FRAMES: usize = 20;
 /// Steadiness of the phase while the start is still rough.
 const STEADY_PHASE: f64 = 0.3;
 
@@ -194,7 +198,7 @@ impl Run<'_> {
         at.state
     }
 
-    /// The rough stages, from the mean motion to ten weights, stature and widths.
+    /// The rough stages, from the mean motion to ten weights, stature and widths, on frames that lie some way apart.
     fn rough(&mut self, state: State, frames: &[Frame]) -> State {
         let mean = Curve::new(self.model, 0);
         let ten = Curve::new(self.model, 10);
@@ -247,7 +251,8 @@ pub fn resume(
     let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
     let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
     let chosen = |points, rays| -> Vec<Frame> {
-        observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
+        let all = observations.par_iter().zip(&outsides);
+        all.map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
     };
     let sparse = chosen(200, 40);
     step(0.0)?;
@@ -258,16 +263,19 @@ pub fn resume(
     step(0.1)?;
     let rough_settings = Settings { model_m: 0.04, ..SETTINGS };
     let ten = Curve::new(model, 10);
+    let times: Vec<f64> = sparse.iter().map(|f| f.time_s).collect();
+    let few = apart(&times);
+    let frames: Vec<Frame> = few.iter().map(|t| sparse[*t].clone()).collect();
     let mut candidates: Vec<(f64, State)> = pair(&found)
         .into_iter()
         .map(|h| {
-            let state = run.rough(h.state.clone(), &sparse);
-            (total(&fitness(&ten, &sparse, &rough_settings, &known, &state)).cost, state)
+            let state = run.rough(h.state.at(&few), &frames);
+            (total(&fitness(&ten, &frames, &rough_settings, &known, &state)).cost, state)
         })
         .collect();
     candidates.sort_by(|a, b| a.0.total_cmp(&b.0));
     let hypotheses = [candidates[0].0, candidates.last().map_or(candidates[0].0, |c| c.0)];
-    let mut state = candidates.swap_remove(0).1;
+    let mut state = candidates.swap_remove(0).1.between(&few, &times);
 
     let dense = chosen(options.points, options.rays);
     step(0.4)?;
@@ -285,7 +293,7 @@ pub fn resume(
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
         let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
         step(0.85)?;
-        let left_out: Vec<Frame> = observations.iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
+        let left_out: Vec<Frame> = observations.par_iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &SETTINGS, &known, state)).cost;
         if cost(&own) < cost(&state) {
             (state, free) = (own, posed);
@@ -293,6 +301,18 @@ pub fn resume(
     }
     step(0.95)?;
     Ok(finish(run, state, free, curve, &dense, observations, hypotheses))
+}
+
+/// Frames at least [`ROUGH_STEP_S`] apart, the first and the last among them; all where that leaves fewer than [`ROUGH_FRAMES`].
+fn apart(times_s: &[f64]) -> Vec<usize> {
+    let mut chosen = vec![0];
+    for t in 1..times_s.len() {
+        // Half a millisecond: times are sums of rounded frame times.
+        if times_s[t] - times_s[chosen[chosen.len() - 1]] > ROUGH_STEP_S - 5e-4 || t + 1 == times_s.len() {
+            chosen.push(t);
+        }
+    }
+    if chosen.len() < ROUGH_FRAMES { (0..times_s.len()).collect() } else { chosen }
 }
 
 /// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.
