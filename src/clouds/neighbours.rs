@@ -2,7 +2,7 @@
 //!
 //! Points are sorted into cubes; a point whose k-th neighbour among its cube and the 26 around it lies within a cube's side knows
 //! its neighbours, the others are asked again with cubes three times as wide. Clouds are sheets of even density, in which cubes
-//! from the median neighbour distance answer nearly all at once, three times as fast as a k-d tree.
+//! from the median neighbour distance answer nearly all at once, half as fast again as a k-d tree.
 //! Checked against brute force.
 
 use std::ops::Range;
@@ -17,14 +17,14 @@ const SIDE: f64 = 1.7;
 const SAMPLED: usize = 32;
 
 type Place = [f64; 3];
-/// Squared distances in rising order; the first is the point itself.
+/// Squared distances, the greatest last; one is that of the point to itself.
 type Nearest = [f64; NEIGHBOURS + 1];
 
 /// Mean distance of every point to its [`NEIGHBOURS`] nearest; of fewer points infinite.
 pub fn mean_distances(places: &[Place]) -> Vec<f64> {
     let mut squares = Vec::new();
     let sample = places.iter().step_by(places.len().div_ceil(SAMPLED).max(1));
-    let last = sample.map(|at| nearest(at, places, &mut squares)[NEIGHBOURS].sqrt());
+    let last = sample.map(|at| nearest(at, places, f64::INFINITY, &mut squares)[NEIGHBOURS].sqrt());
     let mut side = SIDE * quantile(last.collect(), 0.5).unwrap_or(1.0).max(1e-6);
     let mut found = vec![f64::INFINITY; places.len()];
     let mut asked: Vec<usize> = if places.len() > NEIGHBOURS { (0..places.len()).collect() } else { Vec::new() };
@@ -58,8 +58,9 @@ fn ask(places: &[Place], side: f64, asked: &[usize], found: &mut [f64]) -> Vec<u
             around.extend(sorted[row.clone()].iter().map(|(_, i)| places[*i]));
         }
         for i in group.iter().map(|(_, i)| *i).filter(|i| open[*i]) {
-            let nearest = nearest(&places[i], &around, &mut squares);
-            if nearest[NEIGHBOURS] <= side * side || around.len() == places.len() {
+            let limit = if around.len() == places.len() { f64::INFINITY } else { side * side };
+            let nearest = nearest(&places[i], &around, limit, &mut squares);
+            if nearest[NEIGHBOURS] <= limit {
                 found[i] = nearest.iter().map(|d| d.sqrt()).sum::<f64>() / NEIGHBOURS as f64;
             } else {
                 left.push(i);
@@ -70,20 +71,22 @@ fn ask(places: &[Place], side: f64, asked: &[usize], found: &mut [f64]) -> Vec<u
     left
 }
 
-/// The least squared distances between a point and others; `squares` is scratch.
-fn nearest(at: &Place, others: &[Place], squares: &mut Vec<f64>) -> Nearest {
-    let square = |p: &Place| (p[0] - at[0]).powi(2) + (p[1] - at[1]).powi(2) + (p[2] - at[2]).powi(2);
-    squares.clear();
-    squares.extend(others.iter().map(square));
-    let mut least = [f64::INFINITY; NEIGHBOURS + 1];
-    for d in squares {
-        if *d < least[NEIGHBOURS] {
-            let place = least.iter().rposition(|other| *other <= *d).map_or(0, |k| k + 1);
-            least.copy_within(place..NEIGHBOURS, place + 1);
-            least[place] = *d;
-        }
+/// The least squared distances between a point and others; with fewer than needed within `limit` infinite ones at the end.
+/// `squares` is scratch.
+fn nearest(at: &Place, others: &[Place], limit: f64, squares: &mut Vec<f64>) -> Nearest {
+    squares.resize(squares.len().max(others.len() + NEIGHBOURS + 1), f64::INFINITY);
+    let mut count = 0;
+    for p in others {
+        let square = (p[0] - at[0]).powi(2) + (p[1] - at[1]).powi(2) + (p[2] - at[2]).powi(2);
+        // Without a branch: the next overwrites what is too far.
+        squares[count] = square;
+        count += usize::from(square <= limit);
     }
-    least
+    squares[count..=count + NEIGHBOURS].fill(f64::INFINITY);
+    if count > NEIGHBOURS {
+        squares[..count].select_nth_unstable_by(NEIGHBOURS, f64::total_cmp);
+    }
+    std::array::from_fn(|k| squares[k])
 }
 
 #[cfg(test)]

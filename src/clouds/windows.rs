@@ -35,11 +35,11 @@ struct Padded {
 }
 
 impl Padded {
-    fn new(values: impl ExactSizeIterator<Item = f32>, width: usize, border: f32) -> Padded {
+    fn new(values: &[f32], width: usize, border: f32) -> Padded {
         let (height, stride) = (values.len() / width.max(1), width.next_multiple_of(LANES) + 2 * RADIUS);
         let mut padded = vec![border; (height + 2 * RADIUS) * stride];
-        for (i, value) in values.enumerate() {
-            padded[(i / width + RADIUS) * stride + i % width + RADIUS] = value;
+        for (out, row) in padded[RADIUS * stride..].chunks_exact_mut(stride).zip(values.chunks_exact(width.max(1))) {
+            out[RADIUS..][..width].copy_from_slice(row);
         }
         Padded { values: padded, stride }
     }
@@ -61,19 +61,19 @@ pub struct View {
 impl View {
     /// From g and e per pixel, NaN where unknown.
     pub fn new(slopes: &[f32], misfits: &[f32], width: usize) -> View {
-        let known = |(g, e): (&f32, &f32)| !(g + e).is_nan();
-        let of = |value: fn((&f32, &f32)) -> f32| {
-            let values = slopes.iter().zip(misfits).map(|pair| if known(pair) { value(pair) } else { 0.0 });
-            Padded::new(values, width, 0.0)
+        let known: Vec<f32> = slopes.iter().zip(misfits).map(|(g, e)| if (g + e).is_nan() { 0.0 } else { 1.0 }).collect();
+        let of = |values: &[f32]| -> Padded {
+            let values: Vec<f32> = values.iter().zip(&known).map(|(v, known)| if *known > 0.0 { *v } else { 0.0 }).collect();
+            Padded::new(&values, width, 0.0)
         };
-        View { slope: of(|(g, _)| *g), misfit: of(|(_, e)| *e), known: of(|_| 1.0) }
+        View { slope: of(slopes), misfit: of(misfits), known: of(&known) }
     }
 }
 
 /// Value at every pixel of the least-squares plane through the disparities of its window that differ by at most `same_px`, with a
 /// little weight on no slope; NaN where there is no disparity.
 pub fn planes(disparity: &[f32], width: usize, same_px: f32) -> Vec<f32> {
-    let padded = Padded::new(disparity.iter().copied(), width, f32::NAN);
+    let padded = Padded::new(disparity, width, f32::NAN);
     let mut planes = vec![f32::NAN; disparity.len()];
     planes.par_chunks_exact_mut(width.max(1)).enumerate().for_each(|(y, out)| planes_row(&padded, y, same_px, out));
     planes
@@ -81,7 +81,7 @@ pub fn planes(disparity: &[f32], width: usize, same_px: f32) -> Vec<f32> {
 
 /// Sums over the windows of all pixels, of places whose plane differs by at most `same_px`; `None` where there is no plane.
 pub fn sums(planes: &[f32], width: usize, views: &[View], weights: &Weights, same_px: f32) -> Vec<Option<Sums>> {
-    let padded = Padded::new(planes.iter().copied(), width, f32::NAN);
+    let padded = Padded::new(planes, width, f32::NAN);
     let mut sums = vec![None; planes.len()];
     let rows = sums.par_chunks_exact_mut(width.max(1)).enumerate();
     rows.for_each(|(y, out)| sums_row(&padded, views, weights, y, same_px, out));
