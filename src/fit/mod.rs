@@ -1,9 +1,10 @@
 //! Fitting the body to the clouds of all frames at once: style paper §6.1, starting by itself.
 //!
 //! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]) → root, phases, weights, shape by
-//! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart,
-//! then with more components and all points, at last with turns of single joints against the model → poses, weights, shape
-//! and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
+//! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart (till
+//! then over frames a fifteenth of a second apart), then with more components and all points, at last with turns of single
+//! joints against the model → poses, weights, shape and their [`uncertainty`]; what beside the weights is the person's own
+//! ([`own_motion`]).
 //! Components keep what they add to joints all cycle long: without it in the last stage the legs of mesh figures came out 0.4
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
