@@ -26,7 +26,10 @@ pub fn remove_outliers(cloud: Cloud) -> Cloud {
     let middle = median(spreads.clone());
     let deviation = 1.4826 * median(spreads.iter().map(|s| (s - middle).abs()).collect());
     let limit = middle + OUTLIER_LIMIT * deviation.max(0.15 * middle);
-    Cloud { points: cloud.points.into_iter().zip(spreads).filter(|(_, s)| *s <= limit).map(|(p, _)| p).collect() }
+    let mut points: Vec<CloudPoint> = cloud.points.into_iter().zip(spreads).filter(|(_, s)| *s <= limit).map(|(p, _)| p).collect();
+    // Clouds of all frames are kept.
+    points.shrink_to_fit();
+    Cloud { points }
 }
 
 /// The most confident point of every cube of side `voxel_m`, in the order of the cloud.
