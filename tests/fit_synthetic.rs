@@ -77,7 +77,7 @@ fn observed(rig: &Rig, shape: &Shape, frames: &[(usize, f64, &Pose)]) -> Vec<Obs
         let figure = Figure::new(&surface, &offsets, &place(&offsets, pose));
         let points = sighting::points(&figure, group, number, &sight).into_iter();
         let point = |(position, covariance)| CloudPoint { position, colour: [0; 3], confidence: 1.0, covariance };
-        let masks = sighting::masks(&figure, rig, number, &sight).into_iter().map(Some).collect();
+        let masks = Arc::new(sighting::masks(&figure, rig, number, &sight).into_iter().map(Some).collect());
         Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, masks }
     };
     frames.par_iter().map(observe).collect()
@@ -108,7 +108,7 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
     // Ten frames in which nothing was seen, and points that are no numbers.
     let mut gaps = observations.clone();
     for o in &mut gaps[9..19] {
-        (o.cloud, o.masks) = (Cloud::default(), vec![None; rig.cameras.len()]);
+        (o.cloud, o.masks) = (Cloud::default(), Arc::new(vec![None; rig.cameras.len()]));
     }
     let nowhere = CloudPoint { position: Vector3::repeat(f64::NAN), ..gaps[3].cloud.points[0].clone() };
     gaps[3].cloud.points.push(nowhere);

@@ -16,11 +16,15 @@
 //! joints would swell by a third. Neighbouring limbs blend, so thighs swell where they touch.
 //! Checked against central differences, closed forms and ray casting.
 
+// Indexed loops of fixed length are what the compiler turns into vectors.
+#![allow(clippy::needless_range_loop)]
+
 use nalgebra::{Matrix3, Vector3};
 
 use super::pose::Placement;
 use super::shape::{Length, Shape};
 use super::skeleton::Joint;
+use crate::math::exponential::exp_of_negative;
 
 /// Value of d_eff on the skin.
 pub const SKIN: f64 = 0.5 * std::f64::consts::LN_2;
@@ -207,30 +211,41 @@ impl Search {
     }
 
     /// d_b of all primitives at `x`.
-    fn at(&self, x: &Vector3<f64>, into: &mut Vec<f32>) {
+    #[inline(always)]
+    fn at(&self, x: &Vector3<f64>, into: &mut Vec<[f32; BLOCK]>) {
         let [x, y, z] = (x - self.origin).map(|v| v as f32).into();
         into.clear();
         for Block(m) in &self.blocks {
             let u = |row: usize, i: usize| m[3 * row][i] * x + m[3 * row + 1][i] * y + m[3 * row + 2][i] * z + m[9 + row][i];
-            into.extend::<[f32; BLOCK]>(std::array::from_fn(|i| u(0, i) * u(0, i) + u(1, i) * u(1, i) + u(2, i) * u(2, i)));
+            let mut distances = [0.0; BLOCK];
+            for i in 0..BLOCK {
+                distances[i] = u(0, i) * u(0, i) + u(1, i) * u(1, i) + u(2, i) * u(2, i);
+            }
+            into.push(distances);
         }
     }
 
     /// Least d_b of all primitives on the line from `origin` along `direction`, and how far along.
-    fn on_line(&self, origin: &Vector3<f64>, direction: &Vector3<f64>, into: &mut Vec<(f32, f32)>) {
+    #[inline(always)]
+    fn on_line(&self, origin: &Vector3<f64>, direction: &Vector3<f64>, into: &mut Vec<[f32; BLOCK]>, places: &mut Vec<[f32; BLOCK]>) {
         let o: [f32; 3] = (origin - self.origin).map(|v| v as f32).into();
         let v: [f32; 3] = direction.map(|v| v as f32).into();
         into.clear();
+        places.clear();
         for Block(m) in &self.blocks {
             let turned = |a: &[f32; 3], row: usize, i: usize| m[3 * row][i] * a[0] + m[3 * row + 1][i] * a[1] + m[3 * row + 2][i] * a[2];
-            into.extend::<[(f32, f32); BLOCK]>(std::array::from_fn(|i| {
-                let start: [f32; 3] = std::array::from_fn(|row| turned(&o, row, i) + m[9 + row][i]);
-                let way: [f32; 3] = std::array::from_fn(|row| turned(&v, row, i));
+            let [mut distances, mut along] = [[0.0; BLOCK]; 2];
+            for i in 0..BLOCK {
+                let start = [turned(&o, 0, i) + m[9][i], turned(&o, 1, i) + m[10][i], turned(&o, 2, i) + m[11][i]];
+                let way = [turned(&v, 0, i), turned(&v, 1, i), turned(&v, 2, i)];
                 let dot = |a: &[f32; 3], b: &[f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-                let along = -dot(&start, &way) / dot(&way, &way).max(1e-12);
-                let at: [f32; 3] = std::array::from_fn(|k| start[k] + along * way[k]);
-                (dot(&at, &at), along)
-            }));
+                let square = dot(&way, &way);
+                along[i] = -dot(&start, &way) / if square > 1e-12 { square } else { 1e-12 };
+                let at = [start[0] + along[i] * way[0], start[1] + along[i] * way[1], start[2] + along[i] * way[2]];
+                distances[i] = dot(&at, &at);
+            }
+            into.push(distances);
+            places.push(along);
         }
     }
 }
@@ -253,10 +268,12 @@ pub struct Evaluation {
     pub gradient: Vector3<f64>,
     pub shares: Vec<Share>,
     near: Near,
-    distances: Vec<f32>,
-    approaches: Vec<(f32, f32)>,
+    distances: Vec<[f32; BLOCK]>,
+    places: Vec<[f32; BLOCK]>,
 }
 
+/// Longest Newton step along a line.
+const LONGEST_STEP_M: f64 = 0.03;
 /// Largest number of primitives that make the skin at a point.
 const MOST_NEAR: usize = 16;
 
@@ -273,17 +290,25 @@ impl Near {
     }
 
     /// Those whose d exceeds the least by less than `margin`, of too many the nearest.
-    fn select(distances: impl Iterator<Item = f32> + Clone, margin: f32) -> Near {
-        let mut limit = distances.clone().fold(f32::INFINITY, f32::min) + margin;
+    #[inline(always)]
+    fn select(distances: &[[f32; BLOCK]], margin: f32) -> Near {
+        let lower = |a: f32, b: f32| if b < a { b } else { a };
+        let mut least = [f32::INFINITY; BLOCK];
+        for block in distances {
+            for i in 0..BLOCK {
+                least[i] = lower(least[i], block[i]);
+            }
+        }
+        let mut limit = least.into_iter().fold(f32::INFINITY, lower) + margin;
         loop {
             let mut near = Near::default();
             let mut farthest = f32::NEG_INFINITY;
-            for (i, d) in distances.clone().enumerate().filter(|(_, d)| *d < limit) {
-                if (near.count as usize) < MOST_NEAR {
-                    near.indices[near.count as usize] = i as u8;
+            let holds = |block: &[f32; BLOCK]| block.iter().fold(false, |any, d| any | (*d < limit));
+            for (k, block) in distances.iter().enumerate().filter(|(_, block)| holds(block)) {
+                for (i, d) in block.iter().enumerate().filter(|(_, d)| **d < limit) {
+                    near.push(k * BLOCK + i);
+                    farthest = farthest.max(*d);
                 }
-                near.count = near.count.saturating_add(1);
-                farthest = farthest.max(d);
             }
             if near.count as usize <= MOST_NEAR {
                 return near;
@@ -291,6 +316,75 @@ impl Near {
             limit = farthest;
         }
     }
+
+    /// One more; of those beyond [`MOST_NEAR`] only the number is kept.
+    fn push(&mut self, primitive: usize) {
+        if let Some(place) = self.indices.get_mut(self.count as usize) {
+            *place = primitive as u8;
+        }
+        self.count = self.count.saturating_add(1);
+    }
+}
+
+/// The field of some primitives along a line: d_b(s) = α + 2 β s + γ s².
+#[derive(Clone, Debug)]
+struct LineField {
+    near: Near,
+    /// α, β and γ of each; of those that are not there d is large.
+    terms: [[f64; MOST_NEAR]; 3],
+}
+
+impl LineField {
+    /// d_b at `s`.
+    #[inline(always)]
+    fn squares(&self, s: f64) -> [f64; MOST_NEAR] {
+        let [alpha, beta, gamma] = &self.terms;
+        let mut squares = [0.0; MOST_NEAR];
+        for i in 0..MOST_NEAR {
+            squares[i] = alpha[i] + s * (2.0 * beta[i] + s * gamma[i]);
+        }
+        squares
+    }
+
+    /// d_eff at `s`.
+    #[inline(always)]
+    fn d_eff(&self, s: f64) -> f64 {
+        let (nearest, sum) = weigh(&mut self.squares(s), self.near.count as usize);
+        nearest - 0.5 * sum.ln()
+    }
+
+    /// Derivative of d_eff at `s`, and the curvature of the nearest d_b.
+    #[inline(always)]
+    fn slope(&self, s: f64) -> (f64, f64) {
+        let [_, beta, gamma] = &self.terms;
+        let mut weights = self.squares(s);
+        let count = self.near.count as usize;
+        let first = (0..count).fold(0, |first, i| if weights[i] < weights[first] { i } else { first });
+        let (_, sum) = weigh(&mut weights, count);
+        let slopes: f64 = (0..count).map(|i| weights[i] * 2.0 * (beta[i] + gamma[i] * s)).sum();
+        (slopes / sum, 2.0 * gamma[first])
+    }
+
+    /// Those primitives whose d at `s` exceeds the least by less than `margin`.
+    fn near(&self, s: f64, margin: f64) -> Near {
+        let squares = self.squares(s);
+        let limit = squares[..self.near.count as usize].iter().copied().fold(f64::INFINITY, f64::min) + margin;
+        let mut near = Near::default();
+        self.near.indices().zip(squares).filter(|(_, d)| *d < limit).for_each(|(i, _)| near.push(i));
+        near
+    }
+}
+
+/// Turns the first `count` of squared distances into exp(−2 (d − least)); the least and the sum.
+#[inline(always)]
+fn weigh(squares: &mut [f64; MOST_NEAR], count: usize) -> (f64, f64) {
+    let nearest = squares[..count].iter().fold(f64::INFINITY, |least, d| if *d < least { *d } else { least });
+    for four in squares[..count.next_multiple_of(4).min(MOST_NEAR)].as_chunks_mut::<4>().0 {
+        for d in four {
+            *d = exp_of_negative(-2.0 * (*d - nearest));
+        }
+    }
+    (nearest, squares[..count].iter().sum())
 }
 
 impl Evaluation {
@@ -348,25 +442,98 @@ impl PosedSurface {
     /// The primitives that make the skin about `x`: those whose d exceeds the least by less than `margin`, and so have
     /// weights above exp(−2 margin).
     pub fn near(&self, x: &Vector3<f64>, margin: f32, scratch: &mut Evaluation) -> Near {
-        self.search.at(x, &mut scratch.distances);
-        Near::select(scratch.distances.iter().copied(), margin)
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.near_avx2(x, margin, scratch) };
+        }
+        self.near_with(x, margin, scratch)
     }
 
-    /// The primitives that make the skin along a line, and the places along it, at most `count`, that come nearest to single
-    /// ones of them.
-    pub fn near_line(
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn near_avx2(&self, x: &Vector3<f64>, margin: f32, scratch: &mut Evaluation) -> Near {
+        self.near_with(x, margin, scratch)
+    }
+
+    #[inline(always)]
+    fn near_with(&self, x: &Vector3<f64>, margin: f32, scratch: &mut Evaluation) -> Near {
+        self.search.at(x, &mut scratch.distances);
+        Near::select(&scratch.distances, margin)
+    }
+
+    /// How far along the line from `origin` the skin is nearest: least d_eff among the closest approaches to `count` single
+    /// primitives, then refined by `steps` Newton steps; and the primitives that make the skin there, see [`near`](Self::near).
+    pub fn nearest_on_line(
         &self,
         origin: &Vector3<f64>,
         direction: &Vector3<f64>,
         margin: f32,
-        count: usize,
+        [count, steps]: [usize; 2],
         scratch: &mut Evaluation,
-    ) -> (Near, impl Iterator<Item = f64> + use<>) {
-        self.search.on_line(origin, direction, &mut scratch.approaches);
-        let near = Near::select(scratch.approaches.iter().map(|a| a.0), margin);
-        let mut places: Vec<(f32, f32)> = near.indices().map(|i| scratch.approaches[i]).collect();
-        places.sort_by(|a, b| a.0.total_cmp(&b.0));
-        (near, places.into_iter().take(count).map(|p| p.1.into()))
+    ) -> (f64, Near) {
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.nearest_on_line_avx2(origin, direction, margin, [count, steps], scratch) };
+        }
+        self.nearest_on_line_with(origin, direction, margin, [count, steps], scratch)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn nearest_on_line_avx2(
+        &self,
+        origin: &Vector3<f64>,
+        direction: &Vector3<f64>,
+        margin: f32,
+        numbers: [usize; 2],
+        scratch: &mut Evaluation,
+    ) -> (f64, Near) {
+        self.nearest_on_line_with(origin, direction, margin, numbers, scratch)
+    }
+
+    #[inline(always)]
+    fn nearest_on_line_with(
+        &self,
+        origin: &Vector3<f64>,
+        direction: &Vector3<f64>,
+        margin: f32,
+        [count, steps]: [usize; 2],
+        scratch: &mut Evaluation,
+    ) -> (f64, Near) {
+        self.search.on_line(origin, direction, &mut scratch.distances, &mut scratch.places);
+        let near = Near::select(&scratch.distances, margin);
+        let place = |i: usize| (scratch.distances[i / BLOCK][i % BLOCK], scratch.places[i / BLOCK][i % BLOCK]);
+        let mut places = [(f32::INFINITY, 0.0); MOST_NEAR];
+        places.iter_mut().zip(near.indices()).for_each(|(p, i)| *p = place(i));
+        places[..near.count as usize].sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        let field = self.along_line(&near, origin, direction);
+        let mut best = (f64::INFINITY, 0.0);
+        for (_, along) in &places[..count.min(near.count as usize)] {
+            let d_eff = field.d_eff(f64::from(*along));
+            if d_eff < best.0 {
+                best = (d_eff, f64::from(*along));
+            }
+        }
+        // Near one primitive d_eff is a parabola along the line; Newton steps with its curvature settle the blend.
+        let mut along = best.1;
+        for _ in 0..steps {
+            let (slope, curvature) = field.slope(along);
+            along -= (slope / curvature).clamp(-LONGEST_STEP_M, LONGEST_STEP_M);
+        }
+        (along, field.near(along, f64::from(margin)))
+    }
+
+    #[inline(always)]
+    fn along_line(&self, near: &Near, origin: &Vector3<f64>, direction: &Vector3<f64>) -> LineField {
+        let mut terms = [[1e9; MOST_NEAR], [0.0; MOST_NEAR], [0.0; MOST_NEAR]];
+        for (i, primitive) in near.indices().enumerate() {
+            let p = &self.primitives[primitive];
+            let (start, way) = (p.unit_from_world * (origin - p.centre), p.unit_from_world * direction);
+            [start.norm_squared(), start.dot(&way), way.norm_squared()].iter().zip(&mut terms).for_each(|(v, term)| term[i] = *v);
+        }
+        LineField { near: *near, terms }
     }
 
     /// d_eff, its gradient and the contributing primitives at `x`; `into` is reused between calls.
@@ -377,37 +544,64 @@ impl PosedSurface {
 
     /// The same of some primitives only.
     pub fn evaluate_among(&self, near: &Near, x: &Vector3<f64>, into: &mut Evaluation) {
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.evaluate_among_avx2(near, x, into) };
+        }
+        self.evaluate_among_with(near, x, into);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn evaluate_among_avx2(&self, near: &Near, x: &Vector3<f64>, into: &mut Evaluation) {
+        self.evaluate_among_with(near, x, into);
+    }
+
+    #[inline(always)]
+    fn evaluate_among_with(&self, near: &Near, x: &Vector3<f64>, into: &mut Evaluation) {
         into.shares.clear();
-        let mut nearest = f64::INFINITY;
-        for primitive in near.indices() {
+        let mut weights = [1e9; MOST_NEAR];
+        for (weight, primitive) in weights.iter_mut().zip(near.indices()) {
             let p = &self.primitives[primitive];
             let unit = p.unit_from_world * (x - p.centre);
-            nearest = nearest.min(unit.norm_squared());
+            *weight = unit.norm_squared();
             into.shares.push(Share { primitive, force: Vector3::zeros(), unit });
         }
-        let mut sum = 0.0;
+        let (nearest, sum) = weigh(&mut weights, near.count as usize);
+        let over = 1.0 / sum;
         into.gradient = Vector3::zeros();
-        for share in &mut into.shares {
-            let weight = (-2.0 * (share.unit.norm_squared() - nearest)).exp();
-            share.force = self.primitives[share.primitive].unit_from_world.transpose() * share.unit * (2.0 * weight);
-            sum += weight;
+        for (share, weight) in into.shares.iter_mut().zip(weights) {
+            share.force = self.primitives[share.primitive].unit_from_world.tr_mul(&share.unit) * (2.0 * weight * over);
             into.gradient += share.force;
         }
-        into.gradient /= sum;
-        into.shares.iter_mut().for_each(|share| share.force /= sum);
         into.d_eff = nearest - 0.5 * sum.ln();
     }
 
     /// [`Evaluation::root`] of some primitives alone, without the gradient.
     pub fn root_among(&self, near: &Near, x: &Vector3<f64>) -> f64 {
-        let mut distances = [0.0; MOST_NEAR];
-        let mut nearest = f64::INFINITY;
-        for (distance, primitive) in distances.iter_mut().zip(near.indices()) {
-            let p = &self.primitives[primitive];
-            *distance = (p.unit_from_world * (x - p.centre)).norm_squared();
-            nearest = nearest.min(*distance);
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.root_among_avx2(near, x) };
         }
-        let sum: f64 = distances[..near.count as usize].iter().map(|d| (-2.0 * (d - nearest)).exp()).sum();
+        self.root_among_with(near, x)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn root_among_avx2(&self, near: &Near, x: &Vector3<f64>) -> f64 {
+        self.root_among_with(near, x)
+    }
+
+    #[inline(always)]
+    fn root_among_with(&self, near: &Near, x: &Vector3<f64>) -> f64 {
+        let mut squares = [1e9; MOST_NEAR];
+        for (square, primitive) in squares.iter_mut().zip(near.indices()) {
+            let p = &self.primitives[primitive];
+            *square = (p.unit_from_world * (x - p.centre)).norm_squared();
+        }
+        let (nearest, sum) = weigh(&mut squares, near.count as usize);
         root(nearest - 0.5 * sum.ln())
     }
 

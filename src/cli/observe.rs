@@ -1,6 +1,7 @@
 //! A session's frames to what the fit looks at: clouds and silhouettes.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use muybridge::clouds::{CloudError, CloudOptions, CloudRig, FrameCloud};
@@ -12,7 +13,7 @@ use rayon::prelude::*;
 
 use super::{interrupt, progress};
 
-/// Frames that are in memory at once.
+/// Frames that are looked at together; twice as many are in memory.
 const BATCH: usize = 8;
 /// One frame in so many may have a black picture: it counts as not seen.
 const BLANK: usize = 2;
@@ -31,20 +32,17 @@ pub fn observe(
     let mut observations = Vec::with_capacity(session.frame_count);
     let mut frames = session.frames();
     let mut blank = Vec::new();
-    loop {
-        let batch: Vec<FrameSet> = frames.by_ref().take(BATCH).collect::<Result<_, _>>()?;
-        if batch.is_empty() {
-            break;
-        }
-        let clouds: Vec<Result<FrameCloud>> = batch
-            .par_iter()
-            .map(|frame| {
-                interrupt::check()?;
-                let cloud = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
-                bar.inc(1);
-                cloud
-            })
-            .collect();
+    let mut read = || frames.by_ref().take(BATCH).collect::<Result<Vec<FrameSet>, _>>();
+    let mut batch = read()?;
+    while !batch.is_empty() {
+        let of_frame = |frame: &FrameSet| {
+            interrupt::check()?;
+            let cloud = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
+            bar.inc(1);
+            cloud
+        };
+        // The next pictures are read meanwhile.
+        let (next, clouds) = rayon::join(&mut read, || batch.par_iter().map(of_frame).collect::<Vec<Result<FrameCloud>>>());
         for (frame, cloud) in batch.iter().zip(clouds) {
             let cloud = match cloud {
                 Err(error) if matches!(error.downcast_ref::<CloudError>(), Some(CloudError::Blank { .. })) => {
@@ -54,8 +52,10 @@ pub fn observe(
                 cloud => cloud?,
             };
             each(frame, &cloud)?;
-            observations.push(Observation { number: frame.number, time_s: frame.time_s, cloud: cloud.cloud, masks: cloud.masks });
+            let (number, time_s, masks) = (frame.number, frame.time_s, Arc::new(cloud.masks));
+            observations.push(Observation { number, time_s, cloud: cloud.cloud, masks });
         }
+        batch = next?;
     }
     bar.finish();
     if BLANK * blank.len() > session.frame_count {

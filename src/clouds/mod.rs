@@ -6,6 +6,7 @@ pub mod correlate;
 pub mod edges;
 pub mod frame;
 mod lanes;
+mod neighbours;
 pub mod prefilter;
 pub mod smooth;
 pub mod stage;
@@ -14,6 +15,7 @@ pub mod subpixel;
 pub mod tidy;
 pub mod triangulate;
 pub mod validate;
+mod windows;
 
 pub use cloud::{Cloud, CloudPoint};
 pub use frame::{CloudError, CloudOptions, CloudRig, FrameCloud, frame_cloud};

@@ -258,10 +258,14 @@ pub(crate) fn person_mask(
     let places = region.rows(canvas).flatten().zip(changes[k].shaded(region));
     let at = |((i, shaded), (d, stage)): ((usize, bool), (&f32, &f32))| label(rectification, k, i, changes, shaded, [*d, *stage], options);
     let labels: Vec<Label> = places.zip(disparity.iter().zip(&ground)).map(at).collect();
-    let density =
-        |wanted: Label| blur(&labels.iter().map(|&l| if l == wanted { 1.0 } else { 0.0 }).collect::<Vec<_>>(), region.width(), 2.0);
-    let (person, stage) = (density(Label::Person), density(Label::Stage));
-    let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && person[i] > stage[i]);
+    let sides = labels.iter().map(|label| match label {
+        Label::Person => 1.0,
+        Label::Stage => -1.0,
+        Label::Nothing | Label::Undecided => 0.0,
+    });
+    // Positive where there is more of the person than of the stage around.
+    let side = blur(&sides.collect::<Vec<f32>>(), region.width(), 2.0);
+    let set = |i: usize| labels[i] == Label::Person || (labels[i] == Label::Undecided && side[i] > 0.0);
     let mut mask = mask_of(region, set);
     mask = regions::box_vote(&mask, 1, 0.5);
     mask = regions::keep_large(&mask, options.smallest_piece_px);
@@ -361,8 +365,8 @@ fn changed_at(rectification: &Rectification, k: usize, j: usize, i: usize, chang
 fn pixel_in(rectification: &Rectification, k: usize, j: usize, i: usize, disparity: f32) -> Option<usize> {
     let [width, height] = rectification.size_px.map(|s| s as usize);
     let step = rectification.views[j].step - rectification.views[k].step;
-    let x = ((i % width) as f64 + step.x * f64::from(disparity)).round();
-    let y = ((i / width) as f64 + step.y * f64::from(disparity)).round();
+    let x = (i % width) as f64 + step.x * f64::from(disparity) + 0.5;
+    let y = (i / width) as f64 + step.y * f64::from(disparity) + 0.5;
     let inside = x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64;
     inside.then(|| y as usize * width + x as usize)
 }

@@ -21,8 +21,9 @@
 //! Checked against slanted planes and the phantom's known surface.
 
 use super::correlate::{STEP_PENALTIES, Scores};
+use super::windows::{self, RADIUS, Sums, View, Weights};
 use crate::rig::rectify::Plane;
-use nalgebra::{Matrix3, Vector2, Vector3};
+use nalgebra::Vector2;
 use rayon::prelude::*;
 
 /// P1 of the three paths together.
@@ -47,11 +48,8 @@ pub fn equiangular([below, at, above, _]: Scores) -> f32 {
 const ROUNDS: usize = 3;
 /// σ_0 of (2), px. Larger lets noise in where there is no texture, smaller keeps the errors of (1).
 const CORRELATION_SIGMA_PX: f32 = 0.07;
-/// Half-width and standard deviation of the window of (2); larger flattens what is round.
-const WINDOW_PX: isize = 2;
+/// Standard deviation of the window of (2); larger flattens what is round.
 const SPREAD_PX: f32 = 1.5;
-/// Half-width of the plane D.
-const PLANE_PX: isize = 2;
 /// Neighbours that differ by more lie on another surface.
 const SAME_SURFACE_PX: f32 = 1.5;
 /// Longest step that is believed.
@@ -97,13 +95,7 @@ impl<'a> Other<'a> {
     }
 }
 
-/// A view along the surface, per pixel of the reference: grey value at the reference's exposure and g of (2).
-struct Seen {
-    value: Vec<f32>,
-    slope: Vec<f32>,
-}
-
-/// Sums of (2) for one window.
+/// Equation (2) for one window.
 #[derive(Clone, Copy, Default)]
 struct Fit {
     step: f32,
@@ -123,12 +115,12 @@ pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed:
     let here = |other: &Other| slopes(reference, &now, other.step);
     let here: Vec<Vec<f32>> = others.iter().map(here).collect();
     for _ in 0..ROUNDS {
-        let planes: Vec<f32> = per_pixel(&now, |i| plane_at(&now, width as usize, i));
+        let planes = windows::planes(&now, width as usize, SAME_SURFACE_PX);
         let look = |(k, other): (usize, &Other)| look_along(reference, &here[k], other, &planes, confirmed, 1 << k);
-        let seen: Vec<Seen> = others.iter().enumerate().map(look).collect();
-        let found: Vec<Option<Fit>> = (0..now.len()).into_par_iter().map(|i| fit_window(reference, &seen, &planes, &weights, i)).collect();
-        for (i, fit) in found.into_iter().enumerate() {
-            if let Some(fit) = fit.filter(|f| f.step.abs() < LONGEST_STEP_PX) {
+        let seen: Vec<View> = others.iter().enumerate().map(look).collect();
+        let sums = windows::sums(&planes, width as usize, &seen, &weights, SAME_SURFACE_PX);
+        for (i, sums) in sums.iter().enumerate() {
+            if let Some(fit) = sums.and_then(fit).filter(|f| f.step.abs() < LONGEST_STEP_PX) {
                 now[i] = planes[i] + fit.step;
                 fits[i] = Some(fit);
             }
@@ -156,24 +148,6 @@ pub(super) fn around(i: usize, radius: isize, width: usize, count: usize) -> imp
     rows.flat_map(move |qy| ((x - radius).max(0)..(x + radius + 1).min(w)).map(move |qx| (qx - x, qy - y, (qy * w + qx) as usize)))
 }
 
-/// D of (2) at pixel `i`: least squares over the neighbours on its surface, with a little weight on no slope where they are few.
-fn plane_at(disparity: &[f32], width: usize, i: usize) -> f32 {
-    let here = disparity[i];
-    // Sums of 1, x, y, x², xy, y², and of d, d x, d y.
-    let (mut normal, mut right) = ([0.0, 0.0, 0.0, 0.5, 0.0, 0.5], [0.0; 3]);
-    for (dx, dy, j) in around(i, PLANE_PX, width, disparity.len()) {
-        let d = disparity[j] - here;
-        if d.abs() <= SAME_SURFACE_PX {
-            let (x, y) = (dx as f32, dy as f32);
-            normal.iter_mut().zip([1.0, x, y, x * x, x * y, y * y]).for_each(|(sum, v)| *sum += v);
-            right.iter_mut().zip([d, d * x, d * y]).for_each(|(sum, v)| *sum += v);
-        }
-    }
-    let [n, x, y, xx, xy, yy] = normal;
-    let normal = Matrix3::new(n, x, y, x, xx, xy, y, xy, yy);
-    here + normal.cholesky().map_or(0.0, |c| c.solve(&Vector3::from(right))[0])
-}
-
 /// Derivative of the reference's picture along a step, where there is a disparity.
 fn slopes(reference: &Plane, disparity: &[f32], step: Vector2<f32>) -> Vec<f32> {
     let width = reference.width() as usize;
@@ -184,7 +158,7 @@ fn slopes(reference: &Plane, disparity: &[f32], step: Vector2<f32>) -> Vec<f32> 
 }
 
 /// The other view where it sees the surface; NaN where it does not confirm it. `here` are the reference's own derivatives.
-fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], confirmed: &[u8], bit: u8) -> Seen {
+fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], confirmed: &[u8], bit: u8) -> View {
     let width = reference.width() as usize;
     let one = |(i, &d): (usize, &f32)| {
         if d.is_nan() || confirmed[i] & bit == 0 {
@@ -196,8 +170,9 @@ fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], co
     };
     let samples: Vec<(f32, [f32; 2])> = planes.par_iter().enumerate().map(one).collect();
     let (gain, offset) = exposure(samples.iter().zip(reference.iter()).map(|(s, r)| (*r, s.0)));
-    let slope = |s: &(f32, [f32; 2])| 0.5 * (s.1[0] / gain + s.1[1]);
-    Seen { value: samples.iter().map(|s| (s.0 - offset) / gain).collect(), slope: samples.iter().map(slope).collect() }
+    let slopes: Vec<f32> = samples.iter().map(|(_, [there, here])| 0.5 * (there / gain + here)).collect();
+    let misfits: Vec<f32> = samples.iter().zip(reference.iter()).map(|(s, grey)| (s.0 - offset) / gain - grey).collect();
+    View::new(&slopes, &misfits, width)
 }
 
 /// Gain and offset of (reference, other) pairs of grey values, from their means and spreads; NaN pairs do not count.
@@ -212,33 +187,14 @@ fn exposure(pairs: impl Iterator<Item = (f32, f32)>) -> (f32, f32) {
     if gain.is_finite() && gain > 0.0 { (gain as f32, (b - gain * a) as f32) } else { (1.0, 0.0) }
 }
 
-/// w of (2), row by row.
-type WindowWeights = [[f32; 2 * WINDOW_PX as usize + 1]; 2 * WINDOW_PX as usize + 1];
-
-fn window_weights() -> WindowWeights {
-    let squared = |k: usize| (k as f32 - WINDOW_PX as f32).powi(2);
+/// w of (2).
+fn window_weights() -> Weights {
+    let squared = |k: usize| (k as f32 - RADIUS as f32).powi(2);
     std::array::from_fn(|y| std::array::from_fn(|x| (-0.5 * (squared(x) + squared(y)) / (SPREAD_PX * SPREAD_PX)).exp()))
 }
 
-/// Equation (2) at pixel `i`; `None` without a view or without texture.
-fn fit_window(reference: &Plane, seen: &[Seen], planes: &[f32], weights: &WindowWeights, i: usize) -> Option<Fit> {
-    let (here, grey) = (planes[i], reference.as_raw());
-    if here.is_nan() {
-        return None;
-    }
-    let (mut weight, mut gg, mut ge, mut ee) = (0.0, 0.0, 0.0, 0.0);
-    for (dx, dy, j) in around(i, WINDOW_PX, reference.width() as usize, planes.len()) {
-        if (planes[j] - here).abs() > SAME_SURFACE_PX {
-            continue;
-        }
-        let w = weights[(dy + WINDOW_PX) as usize][(dx + WINDOW_PX) as usize];
-        for view in seen {
-            let (g, e) = (view.slope[j], view.value[j] - grey[j]);
-            if !(g + e).is_nan() {
-                (weight, gg, ge, ee) = (weight + w, gg + w * g * g, ge + w * g * e, ee + w * e * e);
-            }
-        }
-    }
+/// Equation (2) from the sums; `None` without a view or without texture.
+fn fit(Sums { weight, gg, ge, ee }: Sums) -> Option<Fit> {
     if gg <= 0.0 {
         return None;
     }
@@ -273,6 +229,7 @@ pub(super) fn extremes(values: &[f32], width: usize, reach: usize, pick: impl Fn
 }
 
 /// Catmull-Rom interpolation; NaN at the border and beside unknown pixels.
+#[inline]
 fn sample(plane: &Plane, x: f32, y: f32) -> f32 {
     if !(x >= 1.0 && y >= 1.0) {
         return f32::NAN;
@@ -283,12 +240,13 @@ fn sample(plane: &Plane, x: f32, y: f32) -> f32 {
         return f32::NAN;
     }
     let (across, down) = (catmull_rom(x - (left + 1) as f32), catmull_rom(y - (top + 1) as f32));
-    let data = plane.as_raw();
-    let row = |j: usize| {
-        let row = &data[(top + j) * width + left..][..4];
-        across[0] * row[0] + across[1] * row[1] + across[2] * row[2] + across[3] * row[3]
-    };
-    down[0] * row(0) + down[1] * row(1) + down[2] * row(2) + down[3] * row(3)
+    // Four columns together.
+    let mut sums = [0.0; 4];
+    for (j, weight) in down.into_iter().enumerate() {
+        let row = plane.as_raw()[(top + j) * width + left..].first_chunk::<4>().unwrap_or(&[f32::NAN; 4]);
+        sums.iter_mut().zip(row).for_each(|(sum, value)| *sum += weight * value);
+    }
+    (across[0] * sums[0] + across[1] * sums[1]) + (across[2] * sums[2] + across[3] * sums[3])
 }
 
 fn catmull_rom(t: f32) -> [f32; 4] {

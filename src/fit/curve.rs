@@ -80,8 +80,8 @@ impl Curve {
         self.cyclic
     }
 
-    /// Values at `phase`, which wraps for cycles and stops at the ends of a jump.
-    pub fn sample(&self, phase: f64, weights: &[f64]) -> CurveSample {
+    /// The samples about `phase`, which wraps for cycles and stops at the ends of a jump, and the place between the middle two.
+    fn neighbours(&self, phase: f64) -> ([usize; 4], f64) {
         let at =
             if self.cyclic { phase.rem_euclid(1.0) * SAMPLES as f64 } else { (phase * SAMPLES as f64).clamp(0.0, (SAMPLES - 1) as f64) };
         let first = at.floor();
@@ -90,6 +90,25 @@ impl Curve {
             let index = first as i64 + k;
             if self.cyclic { index.rem_euclid(SAMPLES as i64) as usize } else { index.clamp(0, SAMPLES as i64 - 1) as usize }
         });
+        (neighbours, u)
+    }
+
+    /// The values of [`sample`](Self::sample) alone.
+    pub fn value(&self, phase: f64, weights: &[f64]) -> DVector<f64> {
+        let (neighbours, u) = self.neighbours(phase);
+        let blend = catmull_rom(u).0;
+        let mut value = DVector::zeros(CHANNELS);
+        for (function, alpha) in self.functions.iter().zip(std::iter::once(&1.0).chain(weights)) {
+            for (column, w) in neighbours.iter().zip(blend) {
+                value.axpy(alpha * w, &function.column(*column), 1.0);
+            }
+        }
+        value
+    }
+
+    /// Values, slopes and components at `phase`.
+    pub fn sample(&self, phase: f64, weights: &[f64]) -> CurveSample {
+        let (neighbours, u) = self.neighbours(phase);
         let (value_weights, slope_weights) = catmull_rom(u);
         let blend = |function: &DMatrix<f64>, w: &[f64; 4]| {
             let mut sum = DVector::zeros(CHANNELS);
@@ -159,6 +178,7 @@ pub(crate) mod tests {
         let at_sample = curve.sample(0.37 + 2.0, &weights);
         let expected = model.mean[37 * DOF + 11] + (0..3).map(|i| weights[i] * model.basis[(37 * DOF + 11, i)]).sum::<f64>();
         assert!((at_sample.value[11] - expected).abs() < 1e-9);
+        assert!((curve.value(0.237, &weights) - curve.sample(0.237, &weights).value).amax() < 1e-14);
         for phase in [0.003, 0.4567, 0.9991, -0.3] {
             let numeric = (curve.sample(phase + 1e-6, &weights).value - curve.sample(phase - 1e-6, &weights).value) / 2e-6;
             assert!((numeric - curve.sample(phase, &weights).slope).amax() < 1e-4, "{phase}");

@@ -1,10 +1,10 @@
 //! Fitting the body to the clouds of all frames at once: style paper §6.1, starting by itself.
 //!
 //! Observations ([`targets`]) → which of several models, on few frames ([`contest`]) → track, heading, cadence and phase by
-//! search ([`start`]) → root, phases, weights, shape by
-//! Levenberg–Marquardt over all frames ([`problem`]), for both half-cycle hypotheses until the cost tells them apart,
-//! then with more components and all points, at last with turns of single joints against the model → poses, weights, shape
-//! and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
+//! search ([`start`]) → root, phases, weights, shape by Levenberg–Marquardt over all frames ([`problem`]), for both
+//! half-cycle hypotheses until the cost tells them apart (till then over frames a fifteenth of a second apart), then with more
+//! components and all points, at last with turns of single joints against the model → poses, weights, shape and their
+//! [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
 //! Components keep what they add to joints all cycle long: without it in the last stage the legs of mesh figures came out 0.4
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
@@ -143,6 +143,10 @@ pub const SETTINGS: Settings = Settings {
 /// A second person in more than one of so many frames is one too many.
 const CROWDED: usize = 4;
 
+/// Between frames of the rough stages: two frames of usual footage, in which legs turn by a few degrees.
+const ROUGH_STEP_S: f64 = 1.0 / 15.0;
+/// Fewer frames are looked at all.
+const ROUGH_FRAMES: usize = 20;
 /// Steadiness of the phase while the start is still rough.
 const STEADY_PHASE: f64 = 0.3;
 /// Difference between skins in the search for a start, and once weights are found roughly, metres.
@@ -273,7 +277,8 @@ pub fn resume(
     let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
     let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
     let chosen = |points, rays| -> Vec<Frame> {
-        observations.iter().zip(&outsides).map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
+        let all = observations.par_iter().zip(&outsides);
+        all.map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
     };
     let sparse = chosen(200, 40);
     step(0.0)?;
@@ -287,17 +292,20 @@ pub fn resume(
     let mut run = Run { known, residual: PointResidual::Distance, iterations: 0, checkpoints, stages: 0 };
     step(0.1)?;
     let rough_settings = Settings { model_m: ROUGH_M, ..SETTINGS };
+    let times: Vec<f64> = sparse.iter().map(|f| f.time_s).collect();
+    let few = apart(&times);
+    let frames: Vec<Frame> = few.iter().map(|t| sparse[*t].clone()).collect();
     let mut halves: Vec<(f64, State)> = pair(&found)
         .into_iter()
         .map(|h| {
-            let placed = run.placed(h.state.clone(), &sparse, &mean);
-            let state = run.styled(placed, &sparse, &ten);
-            (total(&fitness(&ten, &sparse, &rough_settings, &known, &state)).cost, state)
+            let placed = run.placed(h.state.at(&few), &frames, &mean);
+            let state = run.styled(placed, &frames, &ten);
+            (total(&fitness(&ten, &frames, &rough_settings, &known, &state)).cost, state)
         })
         .collect();
     halves.sort_by(|a, b| a.0.total_cmp(&b.0));
     let hypotheses = [halves[0].0, halves.last().map_or(halves[0].0, |c| c.0)];
-    let mut state = halves.swap_remove(0).1;
+    let mut state = halves.swap_remove(0).1.between(&few, &times);
 
     run.residual = options.residual;
     let settings = Settings { residual: options.residual, ..SETTINGS };
@@ -317,7 +325,7 @@ pub fn resume(
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
         let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
         step(0.85)?;
-        let left_out: Vec<Frame> = observations.iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
+        let left_out: Vec<Frame> = observations.par_iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &settings, &known, state)).cost;
         if cost(&own) < cost(&state) {
             (state, free) = (own, posed);
@@ -326,6 +334,18 @@ pub fn resume(
     step(0.95)?;
     let fit = finish(run, state, free, curve, &dense, observations);
     Ok(Fit { model: chosen_model, candidates, hypotheses, ..fit })
+}
+
+/// Frames at least [`ROUGH_STEP_S`] apart, the first and the last among them; all where that leaves fewer than [`ROUGH_FRAMES`].
+fn apart(times_s: &[f64]) -> Vec<usize> {
+    let mut chosen = vec![0];
+    for t in 1..times_s.len() {
+        // Half a millisecond: times are sums of rounded frame times.
+        if times_s[t] - times_s[chosen[chosen.len() - 1]] > ROUGH_STEP_S - 5e-4 || t + 1 == times_s.len() {
+            chosen.push(t);
+        }
+    }
+    if chosen.len() < ROUGH_FRAMES { (0..times_s.len()).collect() } else { chosen }
 }
 
 /// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.

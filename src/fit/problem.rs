@@ -158,6 +158,7 @@ impl<'a> Problem<'a> {
     }
 
     /// The residual as frozen, with the pull whose multiple by the second value is its derivative.
+    #[inline(always)]
     fn residual(motion: &Motion, state: &State, frame: usize, frozen: &Frozen, scratch: &mut Scratch) -> (f64, f64) {
         let surface = &motion.surface;
         surface.evaluate_among(&frozen.near, &frozen.x, &mut scratch.evaluation);
@@ -183,6 +184,22 @@ impl<'a> Problem<'a> {
     }
 
     fn frame_normal(&self, state: &State, surface: &Surface, frame: usize) -> FrameNormal {
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.frame_normal_avx2(state, surface, frame) };
+        }
+        self.frame_normal_with(state, surface, frame)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn frame_normal_avx2(&self, state: &State, surface: &Surface, frame: usize) -> FrameNormal {
+        self.frame_normal_with(state, surface, frame)
+    }
+
+    #[inline(always)]
+    fn frame_normal_with(&self, state: &State, surface: &Surface, frame: usize) -> FrameNormal {
         let motion = state.motion(self.curve, surface, frame);
         let mut scratch = Scratch::default();
         let mut gathered = Gathered::new();

@@ -15,7 +15,7 @@ use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 use super::curve::{Curve, CurveSample};
 use crate::body::{BALL_JOINTS, Joint, Length, Placement, Pose, PosedSurface, Shape, Surface, place};
-use crate::math::rotation::{exp, left_jacobian};
+use crate::math::rotation::{exp, left_jacobian, log};
 
 /// Unknowns of one frame without deviations.
 pub const LOCAL: usize = 7;
@@ -154,12 +154,11 @@ impl State {
 
     /// The pose of one frame, equation (1).
     pub fn pose(&self, curve: &Curve, frame: usize) -> Pose {
-        self.pose_of(&curve.sample(self.carriers[frame].phase, &self.weights), curve, frame)
+        self.pose_of(curve.value(self.carriers[frame].phase, &self.weights).as_slice(), curve, frame)
     }
 
-    fn pose_of(&self, sample: &CurveSample, curve: &Curve, frame: usize) -> Pose {
+    fn pose_of(&self, value: &[f64], curve: &Curve, frame: usize) -> Pose {
         let carrier = &self.carriers[frame];
-        let value = sample.value.as_slice();
         let mut joints: [UnitQuaternion<f64>; BALL_JOINTS] =
             std::array::from_fn(|k| curve.mean_rotations[k] * exp(&CurveSample::joint(value, k)));
         for (joint, turn) in DEVIATING.iter().zip(self.turns(frame)) {
@@ -183,7 +182,7 @@ impl State {
     pub fn motion(&self, curve: &Curve, surface: &Surface, frame: usize) -> Motion {
         let sample = curve.sample(self.carriers[frame].phase, &self.weights);
         let offsets = self.shape.offsets();
-        let placement = place(&offsets, &self.pose_of(&sample, curve, frame));
+        let placement = place(&offsets, &self.pose_of(sample.value.as_slice(), curve, frame));
         let layout = self.layout();
         let turns = self.turns(frame);
         let mut twists = vec![self.root_twist(&sample, frame, &placement)];
@@ -243,6 +242,32 @@ impl State {
         twist
     }
 
+    /// The state of some frames only.
+    pub fn at(&self, frames: &[usize]) -> State {
+        let of = |all: &[Turns]| frames.iter().filter_map(|t| all.get(*t)).copied().collect();
+        let carriers = frames.iter().map(|t| self.carriers[*t].clone()).collect();
+        State { carriers, deviations: of(&self.deviations), ..self.clone() }
+    }
+
+    /// The state of all frames from that of `some` of them in rising order, first and last among them: carriers go steadily
+    /// from one to the next over `times_s`. Without deviations.
+    pub fn between(&self, some: &[usize], times_s: &[f64]) -> State {
+        let carrier = |t: usize| {
+            let b = some.partition_point(|s| *s <= t).min(some.len() - 1);
+            let a = b.saturating_sub(1);
+            let span = times_s[some[b]] - times_s[some[a]];
+            let share = if span > 0.0 { (times_s[t] - times_s[some[a]]) / span } else { 0.0 };
+            let (from, to) = (&self.carriers[a], &self.carriers[b]);
+            let turn = log(&(to.world_from_carrier * from.world_from_carrier.inverse()));
+            Carrier {
+                position: from.position.lerp(&to.position, share),
+                world_from_carrier: UnitQuaternion::new_normalize((exp(&(turn * share)) * from.world_from_carrier).into_inner()),
+                phase: from.phase + share * (to.phase - from.phase),
+            }
+        };
+        State { carriers: (0..times_s.len()).map(carrier).collect(), deviations: Vec::new(), ..self.clone() }
+    }
+
     /// The state moved by the tangent step (y, z).
     pub fn moved(&self, y: &[f64], z: &[f64]) -> State {
         let layout = self.layout();
@@ -277,5 +302,30 @@ fn add_spin(twist: &mut Twist, layout: Layout, sample: &CurveSample, spin: &Matr
     twist.add_turn(6, &(spin * CurveSample::joint(sample.slope.as_slice(), k)), at);
     for i in 0..sample.components.ncols() {
         twist.add_turn(layout.local + i, &(spin * CurveSample::joint(sample.components.column(i).as_slice(), k)), at);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steady_carriers_come_back_between_frames() {
+        let times_s = [0.0, 0.03, 0.07, 0.1, 0.2, 0.21];
+        let carrier = |time_s: &f64| Carrier {
+            position: Vector3::new(1.0, 2.0, 0.9) + Vector3::new(1.3, -0.2, 0.01) * *time_s,
+            world_from_carrier: exp(&(Vector3::new(0.1, 2.0, -0.3) * *time_s)) * exp(&Vector3::new(1.5, 0.0, 0.2)),
+            phase: 0.3 + 0.9 * time_s,
+        };
+        let carriers = times_s.iter().map(carrier).collect();
+        let shape = Shape::template(1.7);
+        let all = State { carriers, weights: vec![1.0], shape, posture: Turns::default(), deviations: Vec::new() };
+        let some = [0, 2, 5];
+        let back = all.at(&some).between(&some, &times_s);
+        assert_eq!(back.carriers.len(), all.carriers.len());
+        for (found, expected) in back.carriers.iter().zip(&all.carriers) {
+            assert!((found.position - expected.position).norm() < 1e-12 && (found.phase - expected.phase).abs() < 1e-12);
+            assert!(found.world_from_carrier.angle_to(&expected.world_from_carrier) < 1e-7);
+        }
     }
 }

@@ -19,7 +19,7 @@ pub struct Observation {
     pub time_s: f64,
     pub cloud: Cloud,
     /// Silhouette per camera of the rig, raw pixels, 255 inside; `None` where a camera has none.
-    pub masks: Vec<Option<GrayImage>>,
+    pub masks: Arc<Vec<Option<GrayImage>>>,
 }
 
 /// Edge of the cubes over which points are averaged: about a correlation window, below which points say the same thing.
@@ -35,7 +35,7 @@ const BORDER_PX: u32 = 3;
 
 /// Distances to the silhouettes of one frame.
 pub fn outsides(observation: &Observation, rig: &Rig) -> Vec<Outside> {
-    let masks = rig.cameras.iter().zip(&observation.masks);
+    let masks = rig.cameras.iter().zip(observation.masks.iter());
     let known = masks.filter_map(|(camera, mask)| mask.as_ref().map(|m| (camera, m)));
     known
         .map(|(camera, mask)| {
@@ -58,7 +58,7 @@ pub fn frame(
     let up = rig.up.direction();
     let lowest = floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M);
     let mut targets = evenly(&thinned(&observation.cloud, |x| x.dot(&up) > lowest), points);
-    for (camera, mask) in rig.cameras.iter().zip(&observation.masks) {
+    for (camera, mask) in rig.cameras.iter().zip(observation.masks.iter()) {
         if let Some(mask) = mask {
             targets.extend(evenly(&outline(mask), rays).iter().filter_map(|pixel| ray(camera, pixel)));
         }

@@ -82,6 +82,8 @@ const FACING: f64 = 0.2;
 const MARGIN: f32 = 5.0;
 /// Primitives that a ray passes nearest to, tried as the start of its closest approach.
 const CANDIDATES: usize = 4;
+/// Newton steps from there.
+const STEPS: usize = 3;
 /// Outlines lower than this above the floor are those of contact shadows.
 const CONTACT_M: f64 = 0.06;
 /// Added to the distance of a point that only the far side of the body explains.
@@ -115,17 +117,18 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
     let mut evaluation = Evaluation::default();
     let mut fitness = Fitness::default();
     let frozen = frame.targets.iter().map(|target| {
-        let (x, deeper_m, base) = match target {
+        let (x, near, deeper_m, base) = match target {
             Target::Point { x, .. } if settings.residual == PointResidual::Ray => {
                 let y = front(surface, &known.viewpoint, x, &mut evaluation);
-                (y, (x - known.viewpoint).norm() - (y - known.viewpoint).norm(), settings.point_weight)
+                let deeper_m = (x - known.viewpoint).norm() - (y - known.viewpoint).norm();
+                (y, surface.near(&y, MARGIN, &mut evaluation), deeper_m, settings.point_weight)
             }
-            Target::Point { x, .. } => (*x, 0.0, settings.point_weight),
+            Target::Point { x, .. } => (*x, surface.near(x, MARGIN, &mut evaluation), 0.0, settings.point_weight),
             Target::Ray { origin, direction, .. } => {
-                (closest_on_ray(surface, origin, direction, &mut evaluation), 0.0, settings.ray_weight)
+                let (along, near) = surface.nearest_on_line(origin, direction, MARGIN, [CANDIDATES, STEPS], &mut evaluation);
+                (origin + direction * along, near, 0.0, settings.ray_weight)
             }
         };
-        let near = surface.near(&x, MARGIN, &mut evaluation);
         surface.evaluate_among(&near, &x, &mut evaluation);
         let normal = evaluation.gradient.normalize();
         let (variance, hidden) = match target {
@@ -209,11 +212,15 @@ const HALVINGS: usize = 12;
 /// Where the line of sight from `eye` to `x` first meets the skin; its point nearest to the skin where it misses.
 fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
     let direction = (x - eye).normalize();
-    let (near, places) = surface.near_line(eye, &direction, MARGIN, CANDIDATES, evaluation);
+    let (nearest, near) = surface.nearest_on_line(eye, &direction, MARGIN, [CANDIDATES, STEPS], evaluation);
     let inside = |along: f64| surface.root_among(&near, &(eye + direction * along)) < SKIN.sqrt();
-    let Some(mut within) = places.filter(|along| inside(*along)).reduce(f64::min) else {
-        return closest_on_ray(surface, eye, &direction, evaluation);
+    let closest = |i: usize| {
+        let p = &surface.primitives[i];
+        let (from, step) = (p.unit_from_world * (eye - p.centre), p.unit_from_world * direction);
+        -from.dot(&step) / step.norm_squared()
     };
+    let places = near.indices().map(closest).chain([nearest]);
+    let Some(mut within) = places.filter(|along| inside(*along)).reduce(f64::min) else { return eye + direction * nearest };
     while within > TO_FRONT_M && inside(within - TO_FRONT_M) {
         within -= TO_FRONT_M;
     }
@@ -223,28 +230,6 @@ fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluatio
         if inside(middle) { within = middle } else { outside = middle }
     }
     eye + direction * (0.5 * (outside + within))
-}
-
-/// The point of a ray nearest to the skin: least d_eff among the closest approaches to the primitives, then refined.
-fn closest_on_ray(surface: &PosedSurface, origin: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
-    let (near, places) = surface.near_line(origin, direction, MARGIN, CANDIDATES, evaluation);
-    let mut best = (f64::INFINITY, 0.0);
-    for along in places {
-        surface.evaluate_among(&near, &(origin + direction * along), evaluation);
-        if evaluation.d_eff < best.0 {
-            best = (evaluation.d_eff, along);
-        }
-    }
-    // Near one primitive d_eff is a parabola along the ray; Newton steps with its curvature settle the blend.
-    let mut along = best.1;
-    for _ in 0..3 {
-        surface.evaluate_among(&near, &(origin + direction * along), evaluation);
-        let nearest = evaluation.shares.iter().min_by(|a, b| a.unit.norm_squared().total_cmp(&b.unit.norm_squared()));
-        let Some(p) = nearest.map(|share| &surface.primitives[share.primitive]) else { break };
-        let curvature = 2.0 * (p.unit_from_world * direction).norm_squared();
-        along -= (evaluation.gradient.dot(direction) / curvature).clamp(-0.03, 0.03);
-    }
-    origin + direction * along
 }
 
 #[cfg(test)]
@@ -261,7 +246,10 @@ mod tests {
         let surface = state.posed(&curve, &Surface::new(&state.shape), 0).surface;
         for target in &frames(&curve, &state)[0].targets {
             if let Target::Ray { origin, direction, .. } = target {
-                let found = closest_on_ray(&surface, origin, direction, &mut Evaluation::default());
+                let steps = [CANDIDATES, STEPS];
+                let (along, near) = surface.nearest_on_line(origin, direction, MARGIN, steps, &mut Evaluation::default());
+                let found = origin + direction * along;
+                assert!((surface.root_among(&near, &found) - surface.evaluate(&found).root()).abs() < 1e-4);
                 let dense =
                     (0..8000).map(|i| surface.evaluate(&(origin + direction * (i as f64 * 1e-3))).d_eff).fold(f64::INFINITY, f64::min);
                 assert!(surface.evaluate(&found).d_eff < dense + 0.02, "{} {dense}", surface.evaluate(&found).d_eff);

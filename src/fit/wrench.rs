@@ -33,6 +33,7 @@ impl Pull {
     }
 
     /// A force on `node` through the point `at`.
+    #[inline]
     pub fn force(&mut self, node: usize, at: &Vector3<f64>, force: &Vector3<f64>) {
         let moment = at.cross(force);
         let wrench = [force.x, force.y, force.z, moment.x, moment.y, moment.z];
@@ -47,6 +48,7 @@ impl Pull {
     }
 
     /// Derivative for size `index`, counted from the stature.
+    #[inline]
     pub fn size(&mut self, index: usize, value: f64) {
         match self.sizes.iter_mut().find(|s| s.0 == index) {
             Some((_, sum)) => *sum += value,
@@ -73,6 +75,7 @@ impl Gradient {
     }
 
     /// Adds `scale` times the pull.
+    #[inline(always)]
     pub fn add(&mut self, scale: f64, pull: &Pull) {
         pull.nodes[..pull.count].iter().for_each(|(node, wrench)| add_scaled(&mut self.nodes[*node], scale, wrench));
         pull.sizes.iter().for_each(|(size, value)| self.sizes[*size] += scale * value);
@@ -119,6 +122,7 @@ impl Gathered {
     }
 
     /// Adds ½ weight r² with r's derivative `factor` times the pull.
+    #[inline(always)]
     pub fn add(&mut self, residual: f64, weight: f64, factor: f64, pull: &mut Pull) {
         pull.scale(factor);
         self.cost += 0.5 * weight * residual * residual;

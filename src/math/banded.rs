@@ -3,6 +3,7 @@
 //! Checked against nalgebra's dense Cholesky.
 
 use nalgebra::DMatrix;
+use rayon::prelude::*;
 
 /// Lower half of a symmetric band matrix: entry (i, j) with 0 ≤ i − j ≤ bandwidth.
 #[derive(Clone, Debug)]
@@ -97,21 +98,24 @@ impl BandCholesky {
     pub fn solve(&self, right: &DMatrix<f64>) -> DMatrix<f64> {
         let l = &self.0;
         let mut x = right.clone();
-        for column in x.as_mut_slice().chunks_exact_mut(l.size.max(1)) {
-            for row in 0..l.size {
-                let first = row.saturating_sub(l.bandwidth);
-                let entries = &l.rows[l.index(row, first)..=l.index(row, row)];
-                column[row] = (column[row] - dot(&entries[..row - first], &column[first..row])) / entries[row - first];
-            }
-            for row in (0..l.size).rev() {
-                let first = row.saturating_sub(l.bandwidth);
-                let entries = &l.rows[l.index(row, first)..=l.index(row, row)];
-                let value = column[row] / entries[row - first];
-                column[row] = value;
-                column[first..row].iter_mut().zip(entries).for_each(|(c, e)| *c -= e * value);
-            }
-        }
+        x.as_mut_slice().par_chunks_exact_mut(l.size.max(1)).for_each(|column| self.solve_column(column));
         x
+    }
+
+    fn solve_column(&self, column: &mut [f64]) {
+        let l = &self.0;
+        for row in 0..l.size {
+            let first = row.saturating_sub(l.bandwidth);
+            let entries = &l.rows[l.index(row, first)..=l.index(row, row)];
+            column[row] = (column[row] - dot(&entries[..row - first], &column[first..row])) / entries[row - first];
+        }
+        for row in (0..l.size).rev() {
+            let first = row.saturating_sub(l.bandwidth);
+            let entries = &l.rows[l.index(row, first)..=l.index(row, row)];
+            let value = column[row] / entries[row - first];
+            column[row] = value;
+            column[first..row].iter_mut().zip(entries).for_each(|(c, e)| *c -= e * value);
+        }
     }
 }
 

@@ -5,6 +5,7 @@ pub mod banded;
 pub mod curves;
 pub mod distance_field;
 pub mod euler;
+pub mod exponential;
 pub mod order;
 pub mod pca;
 pub mod rbf;

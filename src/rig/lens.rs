@@ -133,7 +133,7 @@ fn undistort_brown_conrady(terms: &[f64; 8], drawn: &Vector2<f64>) -> Option<Vec
     let mut at = *drawn;
     for _ in 0..30 {
         let (value, jacobian) = brown_conrady(terms, &at);
-        let step = jacobian.lu().solve(&(drawn - value))?;
+        let step = jacobian.try_inverse()? * (drawn - value);
         at += step;
         if step.norm() < 1e-13 {
             break;

@@ -4,6 +4,7 @@
 //! the person's frame removed, since other skeletons have other joint centres.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use clap::Args;
@@ -109,7 +110,7 @@ fn look(session: &Session, cameras: usize) -> Result<Seen> {
 fn fitted(seen: &Seen, model: &Model, variant: &Variant) -> Result<Fit> {
     let mut observations = seen.observations.clone();
     if !variant.silhouettes {
-        observations.iter_mut().flat_map(|o| &mut o.masks).for_each(|mask| *mask = None);
+        observations.iter_mut().flat_map(|o| Arc::make_mut(&mut o.masks)).for_each(|mask| *mask = None);
     }
     Ok(fit::fit(&observations, &seen.rig, &[model], seen.floor_m, &variant.options, &|_| !interrupt::came())?)
 }

@@ -1,5 +1,7 @@
 //! Phantom walks as the fit gets them, without pictures, and the scores of what it makes of them.
 
+use std::sync::Arc;
+
 use anyhow::{Context, Result};
 use muybridge::body::{NODES, Pose, Shape, Surface, place};
 use muybridge::clouds::{Cloud, CloudPoint};
@@ -158,7 +160,7 @@ pub fn observe(rig: &Rig, shape: &Shape, frames: &[(usize, f64)], poses: &[Pose]
         let points = groups.iter().flat_map(sighted);
         let point = |(position, covariance)| CloudPoint { position, colour: [128; 3], confidence: 1.0, covariance };
         let masks = sighting::masks(&figure, rig, number, sight).into_iter().map(Some).collect();
-        Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, masks }
+        Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, masks: Arc::new(masks) }
     };
     Ok(frames.par_iter().zip(poses).map(of_frame).collect())
 }

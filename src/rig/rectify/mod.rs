@@ -90,6 +90,9 @@ struct Layout {
     distortion: f64,
 }
 
+/// Pixels that are unwarped together if any of them may show the mask.
+const UNWARPED: usize = 16;
+
 impl Rectification {
     /// Ideal pixel of a world point in a view, equation (1); `None` behind the camera.
     pub fn project(&self, view: usize, x_in_world: &Vector3<f64>) -> Option<Vector2<f64>> {
@@ -148,11 +151,16 @@ impl Rectification {
     pub fn unwarp(&self, view: usize, mask: &GrayImage, corner: [usize; 2]) -> GrayImage {
         let [width, height] = self.views[view].camera.size_px;
         let [left, top] = corner.map(|c| c as f32);
+        let [right, bottom] = [left + mask.width() as f32, top + mask.height() as f32];
         let mut raw = GrayImage::new(width, height);
         let rows = raw.par_chunks_exact_mut(width.max(1) as usize).zip(self.views[view].back_map.par_chunks_exact(width.max(1) as usize));
         rows.for_each(|(out, map)| {
-            for (out, [x, y]) in out.iter_mut().zip(map) {
-                *out = if bilinear(mask, x - left, y - top) >= 127.5 { 255 } else { 0 };
+            for (out, map) in out.chunks_mut(UNWARPED).zip(map.chunks(UNWARPED)) {
+                if map.iter().fold(false, |any, [x, y]| any | ((*x >= left) & (*y >= top) & (*x <= right) & (*y <= bottom))) {
+                    for (out, [x, y]) in out.iter_mut().zip(map) {
+                        *out = if bilinear(mask, x - left, y - top) >= 127.5 { 255 } else { 0 };
+                    }
+                }
             }
         });
         raw
