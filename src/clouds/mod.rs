@@ -6,7 +6,6 @@ pub mod correlate;
 pub mod edges;
 pub mod frame;
 mod lanes;
-mod neighbours;
 pub mod prefilter;
 pub mod smooth;
 pub mod stage;
@@ -15,7 +14,6 @@ pub mod subpixel;
 pub mod tidy;
 pub mod triangulate;
 pub mod validate;
-mod windows;
 
 pub use cloud::{Cloud, CloudPoint};
 pub use frame::{CloudError, CloudOptions, CloudRig, FrameCloud, frame_cloud};

@@ -5,9 +5,13 @@
 //! cloud of few points must not excuse its own outliers).
 
 use super::cloud::{Cloud, CloudPoint};
-use super::neighbours;
 use crate::math::order::quantile;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use std::collections::BTreeMap;
+use std::num::NonZero;
+
+/// Neighbours that a point is judged by; fewer let pairs of outliers excuse each other.
+const NEIGHBOURS: usize = 12;
 
 /// c: robust standard deviations of the neighbour distance.
 const OUTLIER_LIMIT: f64 = 6.0;
@@ -21,8 +25,15 @@ pub fn remove_outliers(cloud: Cloud) -> Cloud {
     if places.len() < FEWEST_POINTS {
         return cloud;
     }
-    let spread = |(point, mean): (&CloudPoint, f64)| mean / point.covariance.trace().max(1e-12).sqrt();
-    let spreads: Vec<f64> = cloud.points.iter().zip(neighbours::mean_distances(&places)).map(spread).collect();
+    // More points than a bucket at one place make the tree refuse; such a cloud is left as it is.
+    let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&places) else { return cloud };
+    let wanted = NonZero::new(NEIGHBOURS + 1).unwrap_or(NonZero::<usize>::MIN);
+    let spread = |(point, at): (&CloudPoint, &[f64; 3])| {
+        let near = tree.query(at).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
+        let mean = near.iter().map(|n| n.distance.sqrt()).sum::<f64>() / NEIGHBOURS as f64;
+        mean / point.covariance.trace().max(1e-12).sqrt()
+    };
+    let spreads: Vec<f64> = cloud.points.iter().zip(&places).map(spread).collect();
     let middle = median(spreads.clone());
     let deviation = 1.4826 * median(spreads.iter().map(|s| (s - middle).abs()).collect());
     let limit = middle + OUTLIER_LIMIT * deviation.max(0.15 * middle);
@@ -74,6 +85,20 @@ mod tests {
         let kept = remove_outliers(sheet());
         assert_eq!(kept.points.len(), 900);
         assert!(kept.points.iter().all(|p| p.position.x < 0.5 && p.position.z < 0.1));
+    }
+
+    #[test]
+    fn distances_meet_brute_force() {
+        let cloud = sheet();
+        let places: Vec<[f64; 3]> = cloud.points.iter().map(|p| p.position.into()).collect();
+        let tree = ImmutableKdTree::<f64, 3>::new_from_slice(&places).unwrap();
+        for at in &places {
+            let near = tree.query(at).nearest_n::<SquaredEuclidean<f64>>(NonZero::new(NEIGHBOURS + 1).unwrap()).execute();
+            let mut all: Vec<f64> = places.iter().map(|p| (0..3).map(|k| (p[k] - at[k]).powi(2)).sum()).collect();
+            all.sort_by(f64::total_cmp);
+            let (ours, theirs): (f64, f64) = (near.iter().map(|n| n.distance).sum(), all[..=NEIGHBOURS].iter().sum());
+            assert!((ours - theirs).abs() < 1e-12);
+        }
     }
 
     #[test]
