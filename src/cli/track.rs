@@ -255,7 +255,8 @@ pub fn style(fit: &Fit, model: &NamedModel) -> Style {
     let covariance =
         rows.clone().map(|i| rows.clone().map(|j| fit.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, j)])).collect()).collect();
     let style = Style::of_weights(&model.model, &model.hash, &weights, fit.parameter(model.model.activity), hip_height, fit.cadence_hz);
-    Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }.departing(own_motion::departure(fit, &model.model))
+    let style = Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style };
+    style.departing(own_motion::departure(fit, &model.model)).identified(&model.model)
 }
 
 /// The fitted poses in a y-up world, one per 1/fps second, dropped frames filled in; and the rotation into that world.

@@ -14,6 +14,7 @@ pub mod subpixel;
 pub mod tidy;
 pub mod triangulate;
 pub mod validate;
+mod windows;
 
 pub use cloud::{Cloud, CloudPoint};
 pub use frame::{CloudError, CloudOptions, CloudRig, FrameCloud, frame_cloud};

@@ -9,7 +9,8 @@
 //! misfit of the skin is what the residuals show beyond the points' own covariance. The priors enter as they are:
 //!   Σ = (Σ_kinds s Jᵀ W J + P)⁻¹ + m² Σ_n g_n g_nᵀ.                                                             (2)
 //! The second term: a misfit m that stays with the skin of node n in all frames is averaged out by no number of them; g_n is
-//! how far it moves the solution (consider covariance; G. Bierman, Factorization methods, 1977).
+//! how far it moves the solution (consider covariance; G. Bierman, Factorization methods, 1977). Half of its variance is
+//! common to all nodes, as clothes are and noise that takes points off thin limbs, and moves the solution by Σ_n g_n.
 //! Of the inverse only the blocks of one frame and of the shared unknowns are formed (selected inversion), so time and
 //! memory are linear in the number of frames. A joint at x moves by J δ, hence its covariance is J Σ Jᵀ.
 //! What is not in it: joint centres of another convention, and motions that differ from all subjects of the database.
@@ -62,8 +63,17 @@ pub fn uncertainty(curve: &Curve, frames: &[Frame], settings: &Settings, free: F
     };
     let measured = Settings { point_weight: shares[0], ray_weight: shares[1], ..believed };
     let problem = Problem::new(curve, frames, &measured, free, known, state);
-    let (shared, frames) = propagate(&problem.linearise(state), &(problem.skin_pulls(state) * misfit_m), curve, state)?;
+    let (shared, frames) = propagate(&problem.linearise(state), &misfits(problem.skin_pulls(state), misfit_m), curve, state)?;
     Some(Uncertainty { shared, frames, shares, misfit_m })
+}
+
+/// Pulls of skin that is off by a standard deviation: of each node by itself, and of all together.
+fn misfits(pulls: DMatrix<f64>, misfit_m: f64) -> DMatrix<f64> {
+    let common = pulls.column_sum();
+    let nodes = pulls.ncols();
+    let mut all = pulls.insert_column(nodes, 0.0);
+    all.set_column(nodes, &common);
+    all * (misfit_m * std::f64::consts::FRAC_1_SQRT_2)
 }
 
 /// What the median point's distance shows beyond its own standard deviation along the normal.
@@ -180,7 +190,7 @@ mod tests {
         let state = state();
         let frames = crate::fit::problem::tests::frames(&curve, &state);
         let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
-        let (normal, pulls) = (problem.linearise(&state), problem.skin_pulls(&state) * 0.003);
+        let (normal, pulls) = (problem.linearise(&state), misfits(problem.skin_pulls(&state), 0.003));
         let (shared, found) = propagate(&normal, &pulls, &curve, &state).unwrap();
         let (locals, layout) = (normal.local_gradient.len(), state.layout());
         let dense = DMatrix::from_fn(locals + layout.shared(), locals + layout.shared(), |i, j| match (i < locals, j < locals) {

@@ -140,11 +140,18 @@ fn neighbours(style: &Style) -> Markup {
         .take(LISTED)
         .map(|n| {
             let inside = if n.inside { "yes" } else { "no" };
-            vec![n.subject.clone(), format!("{:.3}", n.distance), format!("{:.3}", n.own_spread), inside.to_string()]
+            let odds = n.log_odds.map_or("-".into(), |odds| format!("{odds:.1}"));
+            vec![n.subject.clone(), format!("{:.3}", n.distance), format!("{:.3}", n.own_spread), inside.to_string(), odds]
         })
         .collect();
     html! {
         h3 { "Nearest subjects that move at this speed or length" }
-        (table(&["subject", "distance (equation 6)", "the subject's own spread", "within it"], &rows, 1))
+        (table(&["subject", "distance (equation 6)", "the subject's own spread", "within it", "log odds against a stranger"], &rows, 1))
+        @if let Some((subject, odds)) = style.likeliest() {
+            p.soft {
+                @if odds > 0.0 { "By the joints that footage shows this is rather " (subject) " than somebody who is not in the database." }
+                @else { "By the joints that footage shows this is rather somebody who is not in the database; of its people " (subject) " is the likeliest." }
+            }
+        }
     }
 }

@@ -146,7 +146,7 @@ impl Population {
     }
 
     /// Subjects that take part at `parameter`; all where none does.
-    fn present(&self, parameter: f64) -> impl Iterator<Item = &Curve> {
+    pub(super) fn present(&self, parameter: f64) -> impl Iterator<Item = &Curve> {
         let nobody = !self.curves.iter().any(|c| c.takes_part(parameter));
         self.curves.iter().filter(move |c| nobody || c.takes_part(parameter))
     }
@@ -171,7 +171,7 @@ impl Population {
             let distance = Metric::Paper.distance(&self.eigenvalues, weights, &here);
             let own_spread = own.fold(0.0, f64::max);
             let mahalanobis = Metric::Mahalanobis.distance(&self.eigenvalues, weights, &here);
-            Neighbour { subject: c.subject.clone(), distance, mahalanobis, own_spread, inside: distance <= own_spread }
+            Neighbour { subject: c.subject.clone(), distance, mahalanobis, own_spread, inside: distance <= own_spread, log_odds: None }
         };
         let mut found: Vec<Neighbour> = self.present(parameter).map(to).collect();
         found.sort_by(|a, b| a.distance.total_cmp(&b.distance));

@@ -129,7 +129,7 @@ mod tests {
         let change = |subjects: &[(&str, f64, &[f64])]| {
             let model = model(subjects, |s| (2.0 * s, -20.0 * s));
             let population = Population::new(&model, model.basis.ncols());
-            let moved = &model.basis.columns(0, population.components()) * &population.slope;
+            let moved = model.basis.columns(0, population.components()) * &population.slope;
             (moved[0], moved[7])
         };
         let (first, second) = change(&subjects);

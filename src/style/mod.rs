@@ -8,6 +8,7 @@ pub mod curves;
 pub mod distance;
 pub mod errors;
 pub mod extrapolate;
+pub mod identity;
 pub mod nearest;
 pub mod space;
 pub mod transfer;
@@ -49,6 +50,10 @@ pub struct Neighbour {
     pub own_spread: f64,
     #[serde(default)]
     pub inside: bool,
+    /// Natural logarithm of how much better this subject explains the motion than somebody drawn from the population
+    /// ([`identity`]); above 0 the person is rather this one than a stranger.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub log_odds: Option<f64>,
 }
 
 /// One person's style as observed once.
@@ -143,6 +148,26 @@ impl Style {
         Style { detail: departure.as_ref().map(Departure::detail), departure, ..self }
     }
 
+    /// With the odds that this is one of the database's subjects, by all that is known of the motion.
+    pub fn identified(mut self, model: &Model) -> Style {
+        let mut vector = model.vector(&self.weights);
+        if let Some(detail) = &self.detail {
+            vector += &detail.vector;
+        }
+        let population = Population::new(model, self.weights.len());
+        for (subject, odds) in identity::log_odds(&population, model, &vector, self.parameter).into_iter().flatten() {
+            let neighbour = self.neighbours.iter_mut().find(|n| n.subject == subject);
+            neighbour.into_iter().for_each(|n| n.log_odds = Some(odds));
+        }
+        self
+    }
+
+    /// The subject that explains the motion best, with its log odds against a stranger.
+    pub fn likeliest(&self) -> Option<(&str, f64)> {
+        let known = self.neighbours.iter().filter_map(|n| Some((n.subject.as_str(), n.log_odds?)));
+        known.max_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
     /// With what was seen of the same person at other times; the first observation stays the main one.
     pub fn and(mut self, other: Style) -> Style {
         self.also.extend(other.observations());
@@ -212,7 +237,7 @@ impl Style {
         let hip_height_m = cycles.iter().map(|c| c.hip_height_m).sum::<f64>() / n;
         let frequency_hz = first.cadence_factor * model.cadence().frequency_hz(first.parameter, hip_height_m);
         let style = Style::of_weights(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
-        Some(Style { detail: first.detail, also, ..style })
+        Some(Style { detail: first.detail, also, ..style }.identified(model))
     }
 }
 

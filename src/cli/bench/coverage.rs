@@ -1,18 +1,21 @@
 //! `muybridge bench coverage`: do the fit's 95 % intervals hold the truth 95 times in 100?
 //!
 //! People drawn from the model and the fit's own priors, so that nothing but noise is between fit and truth; every repeat
-//! has noise of its own. An interval is the estimate ± 1.96 σ.
+//! has noise of its own. Their carriers accelerate as the priors expect, less the slow part (a cubic over the walk), which would
+//! turn them out of their way; `--gliding` people do not accelerate at all and are easier than the fit believes. An interval is
+//! the estimate ± 1.96 σ.
 
 use anyhow::{Context, Result};
 use clap::Args;
 use muybridge::body::{Joint, Length, Pose, Shape, Surface, place};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::state::{Carrier, State, Turns};
-use muybridge::fit::{Fit, FitOptions};
+use muybridge::fit::{Fit, FitOptions, SETTINGS};
+use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, Model};
 use muybridge::phantom::{SightOptions, staging, truth::SCORED};
 use muybridge::rig::Rig;
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
@@ -33,6 +36,9 @@ pub struct CoverageArgs {
     /// Follow the model exactly, without turns of single joints
     #[arg(long)]
     no_deviations: bool,
+    /// People who glide with constant speed, heading and cadence
+    #[arg(long)]
+    gliding: bool,
 }
 
 const FPS: f64 = 30.0;
@@ -73,7 +79,7 @@ pub fn run(args: &CoverageArgs) -> Result<()> {
     for repeat in 0..args.repeats {
         interrupt::check()?;
         let rig = LRig::default().rig();
-        let person = Person::draw(&model, options.components, &rig, repeat % args.people);
+        let person = Person::draw(&model, options.components, &rig, repeat % args.people, args.gliding);
         let sight = SightOptions { seed: 1000 + repeat, disparity_px: args.disparity_noise, ..SightOptions::default() };
         let take = person.film(rig, &sight)?;
         let fit = fitted(&take, &[&model], &options)?;
@@ -104,7 +110,7 @@ struct Person {
 }
 
 impl Person {
-    fn draw(model: &Model, components: usize, rig: &Rig, seed: u64) -> Person {
+    fn draw(model: &Model, components: usize, rig: &Rig, seed: u64, gliding: bool) -> Person {
         let curve = Curve::new(model, components);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut shape = Shape::template(1.6 + 0.25 * rng.random::<f64>());
@@ -123,9 +129,19 @@ impl Person {
             forward,
         ])));
         let middle = Vector3::new(0.0, DISTANCE_M, shape.hip_height_m());
+        let unsteady = if gliding { 0.0 } else { 1.0 };
+        let mut wobble = |sigma: f64| wobble(unsteady * sigma, &mut rng);
+        let moved: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(SETTINGS.acceleration));
+        let turned: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(SETTINGS.angular_acceleration));
+        let ahead = wobble(SETTINGS.phase_acceleration);
         let carrier = |t: usize| {
             let time_s = (t as f64 - 0.5 * (FRAMES - 1) as f64) / FPS;
-            Carrier { position: middle + forward * (SPEED_M_S * time_s), world_from_carrier, phase: begin + CADENCE_HZ * time_s }
+            let of = |channels: &[Vec<f64>; 3]| Vector3::from_fn(|axis, _| channels[axis][t]);
+            Carrier {
+                position: middle + forward * (SPEED_M_S * time_s) + of(&moved),
+                world_from_carrier: exp(&of(&turned)) * world_from_carrier,
+                phase: begin + CADENCE_HZ * time_s + ahead[t],
+            }
         };
         let carriers = (0..FRAMES).map(carrier).collect();
         let state = State { carriers, weights, shape, posture: Turns::default(), deviations: Vec::new() };
@@ -146,6 +162,19 @@ impl Person {
             rig,
         })
     }
+}
+
+/// Accelerations of standard deviation `sigma`, summed twice, less their cubic: one value per frame.
+fn wobble(sigma: f64, rng: &mut ChaCha8Rng) -> Vec<f64> {
+    let (mut rate, mut value) = (0.0, 0.0);
+    let walk = DVector::from_fn(FRAMES, |_, _| {
+        rate += sigma * normal(rng) / FPS;
+        value += rate / FPS;
+        value
+    });
+    let powers = DMatrix::from_fn(FRAMES, 4, |t, k| (2.0 * t as f64 / (FRAMES - 1) as f64 - 1.0).powi(k as i32));
+    let slow = powers.qr().q();
+    (&walk - &slow * slow.tr_mul(&walk)).iter().copied().collect()
 }
 
 /// A standard normal number within 2 standard deviations.

@@ -1,0 +1,70 @@
+//! Who a recorded walk belongs to: every CMU trial against a database that has the others, equation (6) beside the evidence.
+
+use std::path::Path;
+
+use muybridge::io::manifest::find_motions;
+use muybridge::io::read_clip;
+use muybridge::motion_model::{Activity, Cycle, Label, Model, database, segment};
+use muybridge::style::curves::mean_vector;
+use muybridge::style::{Population, Style, curves::knots, identity};
+use nalgebra::DVector;
+use rayon::prelude::*;
+
+const COMPONENTS: usize = 20;
+
+fn walks(data: &Path) -> Vec<Cycle> {
+    let entries = find_motions(&[data.to_path_buf()], None).unwrap();
+    let of = |e: &muybridge::io::manifest::Entry| -> Vec<Cycle> {
+        let source = e.path.file_stem().unwrap().to_string_lossy().into_owned();
+        let label = Label {
+            subject: e.subject.clone(),
+            source,
+            activity: Activity::Walking,
+            parameter: e.parameter,
+            start_s: e.start_s,
+            end_s: e.end_s,
+        };
+        read_clip(&e.path).ok().and_then(|read| segment(&read.clip, &label).ok()).map_or(Vec::new(), |s| s.cycles)
+    };
+    entries.par_iter().flat_map(of).collect()
+}
+
+fn trial(cycle: &Cycle) -> &str {
+    cycle.source.split(' ').next().unwrap()
+}
+
+#[test]
+fn recorded_walkers_are_found_by_evidence_more_often_than_by_equation_6() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap/cmu-asfamc");
+    if !data.is_dir() {
+        println!("skipped: no ../shared/data/mocap/cmu-asfamc");
+        return;
+    }
+    let cycles = database::thin(walks(&data)).0;
+    let mut trials: Vec<&str> = cycles.iter().map(trial).collect();
+    trials.sort();
+    trials.dedup();
+    // Right by equation (6), by evidence, and whether the person is rather this one than a stranger.
+    let found: Vec<[bool; 3]> = trials
+        .par_iter()
+        .filter_map(|name| {
+            let (own, others): (Vec<Cycle>, Vec<Cycle>) = cycles.iter().cloned().partition(|c| trial(c) == *name);
+            let subject = own[0].subject.clone();
+            others.iter().any(|c| c.subject == subject).then(|| {
+                let model = Model::build(Activity::Walking, false, &others).unwrap();
+                let members: Vec<_> = own.iter().map(|c| model.member_of(c)).collect();
+                let knot = &knots(&members)[0];
+                let vector = mean_vector(knot);
+                let weights: DVector<f64> = model.project(&vector).rows(0, COMPONENTS).into_owned();
+                let style = Style::of_weights(&model, "", &weights, knot.parameter, 0.9, 1.0);
+                let population = Population::new(&model, COMPONENTS);
+                let odds = identity::log_odds(&population, &model, &vector, knot.parameter).unwrap();
+                let best = odds.iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+                [style.neighbours[0].subject == subject, best.0 == subject, best.0 == subject && best.1 > 0.0]
+            })
+        })
+        .collect();
+    let right = |k: usize| found.iter().filter(|f| f[k]).count();
+    println!("{} trials: equation (6) {}, evidence {}, of these not a stranger {}", found.len(), right(0), right(1), right(2));
+    assert!(found.len() > 30 && right(1) >= right(0) && 20 * right(1) >= 19 * found.len() && 10 * right(2) >= 8 * found.len());
+}
