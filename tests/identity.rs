@@ -64,6 +64,16 @@ fn recorded_walkers_are_found_by_evidence_more_often_than_by_equation_6() {
             })
         })
         .collect();
+    // People without any cycle in the database who seem to be one of its subjects all the same.
+    let mut people: Vec<&str> = cycles.iter().map(|c| c.subject.as_str()).collect();
+    people.dedup();
+    let taken_for_another = |name: &&&str| {
+        let (own, others): (Vec<Cycle>, Vec<Cycle>) = cycles.iter().cloned().partition(|c| c.subject == ***name);
+        let model = Model::build(Activity::Walking, false, &others).unwrap();
+        let odds = identity::log_odds(&Population::new(&model, COMPONENTS), &model, &model.vector_of(&own[0]), own[0].parameter).unwrap();
+        odds.iter().any(|(_, odds)| *odds > 0.0)
+    };
+    println!("{} of {} strangers are taken for somebody", people.par_iter().filter(taken_for_another).count(), people.len());
     let right = |k: usize| found.iter().filter(|f| f[k]).count();
     println!("{} trials: equation (6) {}, evidence {}, of these not a stranger {}", found.len(), right(0), right(1), right(2));
     assert!(found.len() > 30 && right(1) >= right(0) && 20 * right(1) >= 19 * found.len() && 10 * right(2) >= 8 * found.len());

@@ -213,7 +213,10 @@ const HALVINGS: usize = 12;
 fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
     let direction = (x - eye).normalize();
     let (nearest, near) = surface.nearest_on_line(eye, &direction, MARGIN, [CANDIDATES, STEPS], evaluation);
-    let inside = |along: f64| surface.root_among(&near, &(eye + direction * along)) < SKIN.sqrt();
+    let mut inside = |along: f64| {
+        surface.evaluate_into(&(eye + direction * along), evaluation);
+        evaluation.root() < SKIN.sqrt()
+    };
     let closest = |i: usize| {
         let p = &surface.primitives[i];
         let (from, step) = (p.unit_from_world * (eye - p.centre), p.unit_from_world * direction);
