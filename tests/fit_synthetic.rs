@@ -156,7 +156,8 @@ fn what_people_do_is_found_by_evidence() {
         let costs = [found.model, second].map(|k| found.candidates[k].costs[0]);
         assert!(costs[1] > 1.3 * costs[0], "{activity}: {costs:?}");
         let errors = joint_errors(&positions(found.shape(), &found.poses), &positions(&shape, &poses[seen]));
-        assert!(errors.absolute_m < 0.025 && errors.swapped_over_straight > 2.0, "{activity}: {errors:?}");
+        // Strangers to the model, who may not leave it here.
+        assert!(errors.absolute_m < 0.05 && errors.swapped_over_straight > 2.0, "{activity}: {errors:?}");
         if activity == Activity::Running {
             let alone = fit(&observations, &rig, &[models[found.model]], Some(0.0), &options, &|_| true).unwrap();
             assert_eq!(format!("{:?}", alone.state), format!("{:?}", found.state));
