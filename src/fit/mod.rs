@@ -2,7 +2,7 @@
 //!
 //! Observations ([`targets`]) → which of several models, on few frames ([`contest`]) → track, heading, cadence and phase by
 //! search ([`start`]) → root, phases, weights, shape by Levenberg–Marquardt over all frames ([`problem`]), for both
-//! half-cycle hypotheses until the cost tells them apart (of long sequences over frames a fifteenth of a second apart), then with more
+//! half-cycle hypotheses until the cost tells them apart (till then over frames a fifteenth of a second apart), then with more
 //! components and all points, at last with turns of single joints against the model → poses, weights, shape and their
 //! [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
 //! Components keep what they add to joints all cycle long: without it in the last stage the legs of mesh figures came out 0.4
@@ -145,8 +145,8 @@ const CROWDED: usize = 4;
 
 /// Between frames of the rough stages: two frames of usual footage, in which legs turn by a few degrees.
 const ROUGH_STEP_S: f64 = 1.0 / 15.0;
-/// Fewer frames are looked at all: with 20 of them a random walk of 1.3 s that starts well on all its 39 frames took the wrong half-cycle.
-const ROUGH_FRAMES: usize = 45;
+/// Fewer frames are looked at all.
+const ROUGH_FRAMES: usize = 20;
 /// Steadiness of the phase while the start is still rough.
 const STEADY_PHASE: f64 = 0.3;
 /// Difference between skins in the search for a start, and once weights are found roughly, metres.
