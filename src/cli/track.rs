@@ -338,10 +338,10 @@ fn summary(folder: &Path, models: &[NamedModel], fit: &Fit) {
         }
         println!("{}: {}; it costs {:.0}, the next best, {name}, {:.0}", model.model.activity, model.name, costs[0], costs[1]);
     }
-    if fit.hypotheses[1] < UNDECIDED * fit.hypotheses[0] {
+    let [best, other] = fit.half_cycles();
+    if other < UNDECIDED * best {
         eprintln!(
-            "warning: with left and right legs exchanged the cost is {:.0} against {:.0}; look at the report before you trust the sides",
-            fit.hypotheses[1], fit.hypotheses[0]
+            "warning: with left and right legs exchanged the cost is {other:.0} against {best:.0}; look at the report before you trust the sides"
         );
     }
     let shape = fit.shape();

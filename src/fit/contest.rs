@@ -1,7 +1,7 @@
-//! Which motion model the footage shows: the one with the largest evidence.
+//! The rough start: which motion model the footage shows, which half of the cycle, and where.
 //!
-//! On frames [`APART_S`] apart every model gets its best start and the one half a cycle away, as in the fit itself: the mean motion
-//! placed and turned, then ten weights. With θ the unknowns there, P the precision that data and priors give the weights α, other
+//! On frames [`APART_S`] apart every model gets its best start and the one half a cycle away: the mean motion placed and turned,
+//! then ten weights; the one with the largest evidence is chosen. With θ the unknowns there, P the precision that data and priors give the weights α, other
 //! unknowns eliminated, and Λ their variances in the database,
 //!   −ln p(data | model) ≈ E_data(θ) + E_prior(θ) + ½ ln det(Λ P),                                                  (1)
 //! Laplace's approximation but for what all models have in common; E_data is the robust cost. So a model pays for people unlike
@@ -12,18 +12,26 @@
 //! Checked against phantoms that walk, run and jump, and recorded walks and a run.
 
 use nalgebra::DMatrix;
+use rayon::prelude::*;
 
 use super::curve::Curve;
 use super::problem::{Frame, Known, Problem, Settings};
-use super::start::{self, Track};
+use super::start::{self, Hypothesis, Track};
 use super::state::State;
 use super::weighing::total;
-use super::{Checkpoints, PointResidual, ROUGH_M, Run, SEARCH_M, SETTINGS, STEADY_PHASE, STYLED, pair};
+use super::{PLACED, Run, SETTINGS, STYLED, Stage, TURNED};
 use crate::math::arrow::ArrowProblem;
 use crate::motion_model::Model;
 
 /// Seconds between the frames that decide; a stride of a fast run is seen six times, and nothing is gained by more.
 const APART_S: f64 = 0.1;
+/// Fewer frames are looked at all.
+const FEWEST_FRAMES: usize = 12;
+/// Steadiness of the phase while the start is still rough.
+const STEADY_PHASE: f64 = 0.3;
+/// Difference between skins in the search for a start, and once weights are found roughly, metres.
+const SEARCH_M: f64 = 0.06;
+const ROUGH_M: f64 = 0.04;
 /// Mean motions that cost so many times the best one's are out.
 const HOPELESS: f64 = 2.0;
 
@@ -46,51 +54,70 @@ pub fn runner_up(candidates: &[Candidate]) -> Option<usize> {
     others.min_by(|a, b| candidates[*a].costs[0].total_cmp(&candidates[*b].costs[0]))
 }
 
-/// Equation (1) of every model on some of the frames.
-pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known: &Known) -> Vec<Candidate> {
-    let some = apart(frames);
-    let track = track.at(&some);
-    let frames: Vec<Frame> = some.iter().map(|t| frames[*t].clone()).collect();
-    let mut run = Run { known: *known, residual: PointResidual::Distance, iterations: 0, checkpoints: &Checkpoints::NONE, stages: 0 };
+/// The best start of the model that explains the frames best, on these frames, and how all did.
+pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known: &Known) -> (State, Vec<Candidate>) {
     let search = Settings { model_m: SEARCH_M, ..SETTINGS };
     let rough = Settings { model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, ..SETTINGS };
-    let placed: Vec<Vec<(f64, State)>> = models
-        .iter()
-        .map(|model| {
-            let mean = Curve::new(model, 0);
-            let found = start::hypotheses(&track, &frames, &mean, model, &search, known);
-            let halves = pair(&found).into_iter().map(|h| {
-                let state = run.placed(h.state.clone(), &frames, &mean);
-                (cost(&mean, &frames, &rough, known, &state), state)
-            });
-            halves.collect()
-        })
-        .collect();
-    let least = placed.iter().flatten().map(|half| half.0).fold(f64::INFINITY, f64::min);
-    let of_model = |(model, halves): (&&Model, Vec<(f64, State)>)| {
-        let ten = Curve::new(model, 10);
-        let costs = halves.into_iter().map(|(placed, state)| {
-            if placed > HOPELESS * least {
-                return placed;
-            }
-            cost(&ten, &frames, &rough, known, &run.styled(state, &frames, &ten))
-        });
-        let costs: Vec<f64> = costs.collect();
-        let (a, b) = (costs[0], costs[costs.len() - 1]);
-        Candidate { costs: [a.min(b), a.max(b)] }
+    let begin = |model: &&Model| -> Vec<(f64, State)> {
+        let mean = Curve::new(model, 0);
+        let found = start::hypotheses(track, frames, &mean, model, &search, known);
+        let placed = |h: &Hypothesis| {
+            let state = placed(known, h.state.clone(), frames, &mean);
+            (cost(&mean, frames, &rough, known, &state), state)
+        };
+        pair(&found).into_par_iter().map(placed).collect()
     };
-    models.iter().zip(placed).map(of_model).collect()
+    let begun: Vec<_> = models.par_iter().map(begin).collect();
+    let least = begun.iter().flatten().map(|half| half.0).fold(f64::INFINITY, f64::min);
+    let finish = |(model, halves): (&&Model, Vec<(f64, State)>)| -> Vec<(f64, State)> {
+        let ten = Curve::new(model, 10);
+        let styled = |(placed, state): (f64, State)| {
+            if placed > HOPELESS * least {
+                return (placed, state);
+            }
+            let state = styled(known, state, frames, &ten);
+            (cost(&ten, frames, &rough, known, &state), state)
+        };
+        let mut halves: Vec<_> = halves.into_par_iter().map(styled).collect();
+        halves.sort_by(|a, b| a.0.total_cmp(&b.0));
+        halves
+    };
+    let mut done: Vec<_> = models.par_iter().zip(begun).map(finish).collect();
+    let candidates: Vec<Candidate> = done.iter().map(|halves| Candidate { costs: [halves[0].0, halves[halves.len() - 1].0] }).collect();
+    (done.swap_remove(best(&candidates)).swap_remove(0).1, candidates)
 }
 
-/// Frames at least [`APART_S`] apart, but never fewer than a start needs.
-fn apart(frames: &[Frame]) -> Vec<usize> {
-    let mut chosen: Vec<usize> = Vec::new();
-    for (t, frame) in frames.iter().enumerate() {
-        if chosen.last().is_none_or(|last| frame.time_s - frames[*last].time_s > APART_S - 1e-6) {
+/// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.
+fn pair(found: &[Hypothesis]) -> Vec<&Hypothesis> {
+    let Some(best) = found.first() else { return Vec::new() };
+    let middle = |h: &Hypothesis| h.state.carriers[h.state.carriers.len() / 2].phase;
+    let opposite = found.iter().skip(1).find(|h| ((middle(h) - middle(best) - 0.5).rem_euclid(1.0) - 0.5).abs() > 0.3);
+    std::iter::once(best).chain(opposite).collect()
+}
+
+/// The first rough stages: the mean motion, placed and turned.
+fn placed(known: &Known, state: State, frames: &[Frame], mean: &Curve) -> State {
+    let mut run = Run::rough(known);
+    let state = run.stage(state, frames, mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 });
+    run.stage(state, frames, mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 })
+}
+
+/// The last rough stage: the weights of `ten`, stature and widths.
+fn styled(known: &Known, state: State, frames: &[Frame], ten: &Curve) -> State {
+    let state = State { weights: vec![0.0; ten.components()], ..state };
+    Run::rough(known).stage(state, frames, ten, &Stage { free: STYLED, model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, refreshes: 8 })
+}
+
+/// Frames at least [`APART_S`] apart, the first and the last among them; all where that leaves fewer than [`FEWEST_FRAMES`].
+pub(super) fn apart(times_s: &[f64]) -> Vec<usize> {
+    let mut chosen = vec![0];
+    for t in 1..times_s.len() {
+        // Half a millisecond: times are sums of rounded frame times.
+        if times_s[t] - times_s[chosen[chosen.len() - 1]] > APART_S - 5e-4 || t + 1 == times_s.len() {
             chosen.push(t);
         }
     }
-    if chosen.len() < start::FEWEST_FRAMES { (0..frames.len()).collect() } else { chosen }
+    if chosen.len() < FEWEST_FRAMES { (0..times_s.len()).collect() } else { chosen }
 }
 
 /// Equation (1) at a state.

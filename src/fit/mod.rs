@@ -1,10 +1,9 @@
 //! Fitting the body to the clouds of all frames at once: style paper §6.1, starting by itself.
 //!
-//! Observations ([`targets`]) → which of several models, on few frames ([`contest`]) → track, heading, cadence and phase by
-//! search ([`start`]) → root, phases, weights, shape by Levenberg–Marquardt over all frames ([`problem`]), for both
-//! half-cycle hypotheses until the cost tells them apart (till then over frames a fifteenth of a second apart), then with more
-//! components and all points, at last with turns of single joints against the model → poses, weights, shape and their
-//! [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
+//! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]), for every model and both half-cycle
+//! hypotheses until the evidence of few frames tells them apart ([`contest`]) → root, phases, weights, shape by
+//! Levenberg–Marquardt over all frames ([`problem`]), then with more components, at last with turns of single joints against
+//! the model → poses, weights, shape and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
 //! Components keep what they add to joints all cycle long: without it in the last stage the legs of mesh figures came out 0.4
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
@@ -106,11 +105,9 @@ pub struct Fit {
     /// How sure all that is; `None` where the equations are singular.
     pub uncertainty: Option<Uncertainty>,
     pub frames: Vec<Fitness>,
-    /// Which of the models this is, by its place among those that were given, and how all of them did where several were.
+    /// Which of the models this is, by its place among those that were given, and how all of them did.
     pub model: usize,
     pub candidates: Vec<Candidate>,
-    /// Robust costs of the chosen and the half-cycle-shifted hypothesis when the choice was made.
-    pub hypotheses: [f64; 2],
     pub iterations: u64,
     /// Mean horizontal speed of the carrier, m/s.
     pub speed_m_s: f64,
@@ -142,16 +139,6 @@ pub const SETTINGS: Settings = Settings {
 
 /// A second person in more than one of so many frames is one too many.
 const CROWDED: usize = 4;
-
-/// Between frames of the rough stages: two frames of usual footage, in which legs turn by a few degrees.
-const ROUGH_STEP_S: f64 = 1.0 / 15.0;
-/// Fewer frames are looked at all.
-const ROUGH_FRAMES: usize = 20;
-/// Steadiness of the phase while the start is still rough.
-const STEADY_PHASE: f64 = 0.3;
-/// Difference between skins in the search for a start, and once weights are found roughly, metres.
-const SEARCH_M: f64 = 0.06;
-const ROUGH_M: f64 = 0.04;
 
 #[derive(Clone, Copy)]
 struct Stage {
@@ -201,6 +188,11 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
+    /// Stages of which no checkpoints are kept.
+    fn rough(known: &Known) -> Run<'static> {
+        Run { known: *known, residual: PointResidual::Distance, iterations: 0, checkpoints: &Checkpoints::NONE, stages: 0 }
+    }
+
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
     fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
         let (model_m, phase_acceleration) = (stage.model_m, stage.phase_acceleration);
@@ -220,19 +212,6 @@ impl Run<'_> {
         self.stages += 1;
         self.iterations += at.iterations;
         at.state
-    }
-
-    /// The first rough stages: the mean motion `mean`, placed and turned.
-    fn placed(&mut self, state: State, frames: &[Frame], mean: &Curve) -> State {
-        let state = State { weights: Vec::new(), ..state };
-        let state = self.stage(state, frames, mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 });
-        self.stage(state, frames, mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 })
-    }
-
-    /// The last rough stage: the weights of `ten`, stature and widths.
-    fn styled(&mut self, state: State, frames: &[Frame], ten: &Curve) -> State {
-        let state = State { weights: vec![0.0; ten.components()], ..state };
-        self.stage(state, frames, ten, &Stage { free: STYLED, model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, refreshes: 8 })
     }
 }
 
@@ -276,40 +255,22 @@ pub fn resume(
     let track = start::track(observations, &viewpoint, &up, floor_m)?;
     let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
     let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
-    let chosen = |points, rays| -> Vec<Frame> {
-        let all = observations.par_iter().zip(&outsides);
-        all.map(|(o, outside)| targets::frame(o, rig, outside, known.floor_m, points, rays)).collect()
+    let chosen = |which: &[usize], points, rays| -> Vec<Frame> {
+        which.par_iter().map(|t| targets::frame(&observations[*t], rig, &outsides[*t], known.floor_m, points, rays)).collect()
     };
-    let sparse = chosen(200, 40);
+    let all: Vec<usize> = (0..observations.len()).collect();
+    let times: Vec<f64> = observations.iter().map(|o| o.time_s).collect();
+    let few = contest::apart(&times);
+    let sparse = chosen(&few, 200, 40);
     step(0.0)?;
-    let candidates = if models.len() > 1 { contest::contest(models, &track, &sparse, &known) } else { Vec::new() };
-    let chosen_model = contest::best(&candidates);
-    let model = models[chosen_model];
-    let (mean, ten) = (Curve::new(model, 0), Curve::new(model, 10));
-    step(0.08)?;
-    let search = Settings { model_m: SEARCH_M, ..SETTINGS };
-    let found = start::hypotheses(&track, &sparse, &mean, model, &search, &known);
-    let mut run = Run { known, residual: PointResidual::Distance, iterations: 0, checkpoints, stages: 0 };
-    step(0.1)?;
-    let rough_settings = Settings { model_m: ROUGH_M, ..SETTINGS };
-    let times: Vec<f64> = sparse.iter().map(|f| f.time_s).collect();
-    let few = apart(&times);
-    let frames: Vec<Frame> = few.iter().map(|t| sparse[*t].clone()).collect();
-    let mut halves: Vec<(f64, State)> = pair(&found)
-        .into_iter()
-        .map(|h| {
-            let placed = run.placed(h.state.at(&few), &frames, &mean);
-            let state = run.styled(placed, &frames, &ten);
-            (total(&fitness(&ten, &frames, &rough_settings, &known, &state)).cost, state)
-        })
-        .collect();
-    halves.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let hypotheses = [halves[0].0, halves.last().map_or(halves[0].0, |c| c.0)];
-    let mut state = halves.swap_remove(0).1.between(&few, &times);
+    let (rough, candidates) = contest::contest(models, &track.at(&few), &sparse, &known);
+    let model = models[contest::best(&candidates)];
+    let mut state = rough.between(&few, &times);
+    let ten = Curve::new(model, 10);
 
-    run.residual = options.residual;
+    let mut run = Run { known, residual: options.residual, iterations: 0, checkpoints, stages: 0 };
     let settings = Settings { residual: options.residual, ..SETTINGS };
-    let dense = chosen(options.points, options.rays);
+    let dense = chosen(&all, options.points, options.rays);
     step(0.4)?;
     let shaped = if options.lengths { SHAPED } else { STYLED };
     let last = Stage { free: shaped, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
@@ -332,51 +293,26 @@ pub fn resume(
         }
     }
     step(0.95)?;
-    let fit = finish(run, state, free, curve, &dense, observations);
-    Ok(Fit { model: chosen_model, candidates, hypotheses, ..fit })
+    Ok(finish(run, candidates, state, free, curve, &dense))
 }
 
-/// Frames at least [`ROUGH_STEP_S`] apart, the first and the last among them; all where that leaves fewer than [`ROUGH_FRAMES`].
-fn apart(times_s: &[f64]) -> Vec<usize> {
-    let mut chosen = vec![0];
-    for t in 1..times_s.len() {
-        // Half a millisecond: times are sums of rounded frame times.
-        if times_s[t] - times_s[chosen[chosen.len() - 1]] > ROUGH_STEP_S - 5e-4 || t + 1 == times_s.len() {
-            chosen.push(t);
-        }
-    }
-    if chosen.len() < ROUGH_FRAMES { (0..times_s.len()).collect() } else { chosen }
-}
-
-/// The best hypothesis and the best one about half a cycle from it, which for a jump is another timing.
-fn pair(found: &[start::Hypothesis]) -> Vec<&start::Hypothesis> {
-    let Some(best) = found.first() else { return Vec::new() };
-    let middle = |h: &start::Hypothesis| h.state.carriers[h.state.carriers.len() / 2].phase;
-    let opposite = found.iter().skip(1).find(|h| ((middle(h) - middle(best) - 0.5).rem_euclid(1.0) - 0.5).abs() > 0.3);
-    std::iter::once(best).chain(opposite).collect()
-}
-
-/// The fit without what was said of its rivals.
-fn finish(run: Run, state: State, free: Free, curve: Curve, frames: &[Frame], observations: &[Observation]) -> Fit {
+fn finish(run: Run, candidates: Vec<Candidate>, state: State, free: Free, curve: Curve, frames: &[Frame]) -> Fit {
     let settings = Settings { residual: run.residual, ..SETTINGS };
     let uncertainty = uncertainty::uncertainty(&curve, frames, &settings, free, &run.known, &state);
+    let seconds = frames.last().map_or(0.0, |f| f.time_s) - frames.first().map_or(0.0, |f| f.time_s);
     let frames = fitness(&curve, frames, &settings, &run.known, &state);
     let poses = (0..state.carriers.len()).map(|t| state.pose(&curve, t)).collect();
-    let seconds = observations.last().map_or(0.0, |o| o.time_s) - observations.first().map_or(0.0, |o| o.time_s);
     let (first, last) = (&state.carriers[0], &state.carriers[state.carriers.len() - 1]);
     let travelled: f64 =
         state.carriers.windows(2).map(|w| w[1].position - w[0].position).map(|d| (d - run.known.up * d.dot(&run.known.up)).norm()).sum();
     let (speed_m_s, cadence_hz) = (travelled / seconds, (last.phase - first.phase) / seconds);
-    let (up, hypotheses) = (run.known.up, [f64::NAN; 2]);
-    let candidates = Vec::new();
     Fit {
-        model: 0,
+        model: contest::best(&candidates),
         candidates,
-        up,
+        up: run.known.up,
         poses,
         uncertainty,
         frames,
-        hypotheses,
         iterations: run.iterations,
         speed_m_s,
         cadence_hz,
@@ -395,6 +331,11 @@ impl Fit {
             }
             _ => self.speed_m_s,
         }
+    }
+
+    /// Costs of the chosen and of the other half-cycle when the choice was made.
+    pub fn half_cycles(&self) -> [f64; 2] {
+        self.candidates[self.model].costs
     }
 
     /// Shape of the person.

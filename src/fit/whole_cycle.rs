@@ -107,7 +107,6 @@ mod tests {
             frames: Vec::new(),
             model: 0,
             candidates: Vec::new(),
-            hypotheses: [1.0, 2.0],
             iterations: 0,
             speed_m_s: 1.2,
             cadence_hz: 0.9,

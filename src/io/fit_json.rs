@@ -98,7 +98,7 @@ pub fn write(path: &Path, fit: &Fit, observations: &[Observation], models: &[Mod
         components: fit.state.weights.len(),
         iterations: fit.iterations,
         cost: sum.cost,
-        hypothesis_costs: fit.hypotheses,
+        hypothesis_costs: fit.half_cycles(),
         rms_distance_m: fit.rms_m(),
         points: observations.iter().map(|o| o.cloud.points.len()).sum(),
         points_used: sum.inliers,

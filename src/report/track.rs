@@ -96,7 +96,7 @@ impl TrackReport<'_> {
 
     fn doubts(&self) -> Vec<String> {
         let (fit, mut notes) = (self.fit, Vec::new());
-        let [best, other] = fit.hypotheses;
+        let [best, other] = fit.half_cycles();
         if other < UNDECIDED * best {
             notes.push(format!(
                 "Left and right may be exchanged: with the legs swapped the cost is {other:.0} against {best:.0}. Look at the pictures."
@@ -229,7 +229,7 @@ impl TrackReport<'_> {
         let mut all: Vec<_> = self.given.iter().zip(&self.fit.candidates).map(|(name, c)| (c.costs, name)).collect();
         all.sort_by(|a, b| a.0[0].total_cmp(&b.0[0]));
         let each: Vec<String> = all.iter().map(|([best, other], name)| format!("{name} {best:.0} ({other:.0})")).collect();
-        if each.is_empty() { "none, one model was given".into() } else { each.join(", ") }
+        each.join(", ")
     }
 
     fn facts(&self) -> Markup {

@@ -158,7 +158,10 @@ fn starts(count: u64, models: &[&Model]) -> Result<()> {
                     errors.push(found.joints_mm);
                     angles.push(found.legs_deg);
                 } else {
-                    missed(seed, &walk, &format!("{:.0} mm, {:.1} deg, right {}", found.joints_mm, found.legs_deg, found.right));
+                    let costs: Vec<String> = found.candidates.iter().map(|c| format!("{:.0} ({:.0})", c.costs[0], c.costs[1])).collect();
+                    let what =
+                        format!("{:.0} mm, {:.1} deg, right {}, costs {}", found.joints_mm, found.legs_deg, found.right, costs.join(", "));
+                    missed(seed, &walk, &what);
                 }
             }
             Ok(None) => missed(seed, &walk, "nobody found"),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use muybridge::body::{NODES, Pose, Shape, Surface, place};
 use muybridge::clouds::{Cloud, CloudPoint};
-use muybridge::fit::{self, Fit, FitError, FitOptions, Observation};
+use muybridge::fit::{self, Candidate, Fit, FitError, FitOptions, Observation};
 use muybridge::motion::{Length, play_cycle};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{Figure, SightOptions, joint_errors, sighting, staging, truth::Positions};
@@ -166,13 +166,15 @@ pub fn observe(rig: &Rig, shape: &Shape, frames: &[(usize, f64)], poses: &[Pose]
 }
 
 /// How a fit stands to the truth.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Score {
     pub joints_mm: f64,
     /// Mean error of hips' and knees' included angles, degrees.
     pub legs_deg: f64,
     /// The model is one of what was done, left is left, and the phase of a cycle is right to a quarter.
     pub right: bool,
+    /// Costs of all models, each with the better and the other half-cycle.
+    pub candidates: Vec<Candidate>,
 }
 
 impl Score {
@@ -202,5 +204,6 @@ pub fn score(take: &Take, models: &[&Model], options: &FitOptions) -> Result<Opt
         right: models[fit.model].activity == take.activity
             && errors.swapped_over_straight > 1.0
             && (apart.abs() < 0.25 || !take.activity.is_cyclic()),
+        candidates: fit.candidates,
     }))
 }
