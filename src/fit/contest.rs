@@ -57,13 +57,12 @@ pub fn runner_up(candidates: &[Candidate]) -> Option<usize> {
 /// The best start of the model that explains the frames best, on these frames, and how all did.
 pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known: &Known) -> (State, Vec<Candidate>) {
     let search = Settings { model_m: SEARCH_M, ..SETTINGS };
-    let rough = Settings { model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, ..SETTINGS };
     let begin = |model: &&Model| -> Vec<(f64, State)> {
         let mean = Curve::new(model, 0);
         let found = start::hypotheses(track, frames, &mean, model, &search, known);
         let placed = |h: &Hypothesis| {
             let state = placed(known, h.state.clone(), frames, &mean);
-            (cost(&mean, frames, &rough, known, &state), state)
+            (cost(&mean, frames, known, &state), state)
         };
         pair(&found).into_par_iter().map(placed).collect()
     };
@@ -76,7 +75,7 @@ pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known:
                 return (placed, state);
             }
             let state = styled(known, state, frames, &ten);
-            (cost(&ten, frames, &rough, known, &state), state)
+            (cost(&ten, frames, known, &state), state)
         };
         let mut halves: Vec<_> = halves.into_par_iter().map(styled).collect();
         halves.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -95,17 +94,22 @@ fn pair(found: &[Hypothesis]) -> Vec<&Hypothesis> {
     std::iter::once(best).chain(opposite).collect()
 }
 
+/// Settings where skins may be `model_m` apart.
+fn rough(model_m: f64) -> Settings {
+    Settings { model_m, phase_acceleration: STEADY_PHASE, ..SETTINGS }
+}
+
 /// The first rough stages: the mean motion, placed and turned.
 fn placed(known: &Known, state: State, frames: &[Frame], mean: &Curve) -> State {
     let mut run = Run::rough(known);
-    let state = run.stage(state, frames, mean, &Stage { free: PLACED, model_m: 0.08, phase_acceleration: STEADY_PHASE, refreshes: 4 });
-    run.stage(state, frames, mean, &Stage { free: TURNED, model_m: 0.06, phase_acceleration: STEADY_PHASE, refreshes: 6 })
+    let state = run.stage(state, frames, mean, &Stage { free: PLACED, settings: rough(0.08), refreshes: 4 });
+    run.stage(state, frames, mean, &Stage { free: TURNED, settings: rough(0.06), refreshes: 6 })
 }
 
 /// The last rough stage: the weights of `ten`, stature and widths.
 fn styled(known: &Known, state: State, frames: &[Frame], ten: &Curve) -> State {
     let state = State { weights: vec![0.0; ten.components()], ..state };
-    Run::rough(known).stage(state, frames, ten, &Stage { free: STYLED, model_m: ROUGH_M, phase_acceleration: STEADY_PHASE, refreshes: 8 })
+    Run::rough(known).stage(state, frames, ten, &Stage { free: STYLED, settings: rough(ROUGH_M), refreshes: 8 })
 }
 
 /// Frames at least [`APART_S`] apart, the first and the last among them; all where that leaves fewer than [`FEWEST_FRAMES`].
@@ -121,8 +125,9 @@ pub(super) fn apart(times_s: &[f64]) -> Vec<usize> {
 }
 
 /// Equation (1) at a state.
-fn cost(curve: &Curve, frames: &[Frame], settings: &Settings, known: &Known, state: &State) -> f64 {
-    let problem = Problem::new(curve, frames, settings, STYLED, known, state);
+fn cost(curve: &Curve, frames: &[Frame], known: &Known, state: &State) -> f64 {
+    let settings = rough(ROUGH_M);
+    let problem = Problem::new(curve, frames, &settings, STYLED, known, state);
     let covariance = problem.linearise(state).shared_covariance();
     let weights = curve.components();
     let occam = covariance.map_or(0.0, |c| {

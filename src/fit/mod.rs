@@ -143,8 +143,7 @@ const CROWDED: usize = 4;
 #[derive(Clone, Copy)]
 struct Stage {
     free: Free,
-    model_m: f64,
-    phase_acceleration: f64,
+    settings: Settings,
     refreshes: usize,
 }
 
@@ -195,12 +194,10 @@ impl Run<'_> {
 
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
     fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
-        let (model_m, phase_acceleration) = (stage.model_m, stage.phase_acceleration);
-        let settings = Settings { model_m, phase_acceleration, residual: self.residual, ..SETTINGS };
         let begun = (self.checkpoints.load)(self.stages);
         let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, cost: f64::INFINITY, state });
         while at.rounds < stage.refreshes {
-            let problem = Problem::new(curve, frames, &settings, stage.free, &self.known, &at.state);
+            let problem = Problem::new(curve, frames, &stage.settings, stage.free, &self.known, &at.state);
             let cost = total(&problem.fitness).cost;
             if (at.cost - cost).abs() < 1e-3 * cost {
                 break;
@@ -247,19 +244,18 @@ pub fn resume(
     if observations.len() < start::FEWEST_FRAMES {
         return Err(FitError::TooShort { frames: observations.len(), needed: start::FEWEST_FRAMES });
     }
-    let (alone, crowded) = people::largest(observations, &up);
-    if CROWDED * crowded > observations.len() {
-        return Err(FitError::Crowd { crowded, frames: observations.len() });
+    let (people, crowded) = people::largest(observations, rig);
+    if CROWDED * crowded > people.len() {
+        return Err(FitError::Crowd { crowded, frames: people.len() });
     }
-    let observations = &alone;
-    let track = start::track(observations, &viewpoint, &up, floor_m)?;
-    let outsides: Vec<Arc<Vec<Outside>>> = observations.par_iter().map(|o| Arc::new(targets::outsides(o, rig))).collect();
+    let track = start::track(&people, &viewpoint, &up, floor_m)?;
+    let outsides: Vec<Arc<Vec<Outside>>> = people.par_iter().map(|p| Arc::new(targets::outsides(p, rig))).collect();
     let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
     let chosen = |which: &[usize], points, rays| -> Vec<Frame> {
-        which.par_iter().map(|t| targets::frame(&observations[*t], rig, &outsides[*t], known.floor_m, points, rays)).collect()
+        which.par_iter().map(|t| targets::frame(&people[*t], rig, &outsides[*t], known.floor_m, points, rays)).collect()
     };
-    let all: Vec<usize> = (0..observations.len()).collect();
-    let times: Vec<f64> = observations.iter().map(|o| o.time_s).collect();
+    let all: Vec<usize> = (0..people.len()).collect();
+    let times: Vec<f64> = people.iter().map(|p| p.time_s()).collect();
     let few = contest::apart(&times);
     let sparse = chosen(&few, 200, 40);
     step(0.0)?;
@@ -273,8 +269,8 @@ pub fn resume(
     let dense = chosen(&all, options.points, options.rays);
     step(0.4)?;
     let shaped = if options.lengths { SHAPED } else { STYLED };
-    let last = Stage { free: shaped, model_m: SETTINGS.model_m, phase_acceleration: SETTINGS.phase_acceleration, refreshes: 10 };
-    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, model_m: 0.03, refreshes: 5, ..last });
+    let last = Stage { free: shaped, settings, refreshes: 10 };
+    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, settings: Settings { model_m: 0.03, ..settings }, refreshes: 5 });
     step(0.55)?;
     let curve = Curve::new(model, options.variance.map_or(options.components, |part| model.components(part)));
     state.weights.resize(curve.components(), 0.0);
@@ -286,7 +282,7 @@ pub fn resume(
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
         let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
         step(0.85)?;
-        let left_out: Vec<Frame> = observations.par_iter().map(|o| targets::left_out(o, rig, known.floor_m, options.points)).collect();
+        let left_out: Vec<Frame> = people.par_iter().map(|p| targets::left_out(p, rig, known.floor_m, options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &settings, &known, state)).cost;
         if cost(&own) < cost(&state) {
             (state, free) = (own, posed);

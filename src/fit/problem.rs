@@ -55,7 +55,7 @@ pub struct Frame {
 }
 
 /// Standard deviations and weights of equation (1).
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug)]
 pub struct Settings {
     pub residual: PointResidual,
     /// Difference between the person's skin and the model's, m; large at the start so that far points pull.
@@ -143,6 +143,12 @@ impl<'a> Problem<'a> {
     /// The residuals of each frame as frozen.
     pub fn frozen(&self) -> &[Vec<Frozen>] {
         &self.frozen
+    }
+
+    /// The same problem with other weights of the targets.
+    pub fn reweighted(mut self, weight: impl Fn(&Frozen) -> f64) -> Problem<'a> {
+        self.frozen.iter_mut().flatten().for_each(|f| f.weight = weight(f));
+        self
     }
 
     /// Pull of a force on the centre of primitive `index`, which also scales with the sizes; not its widths.

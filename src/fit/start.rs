@@ -11,9 +11,9 @@ use rayon::prelude::*;
 
 use super::FitError;
 use super::curve::Curve;
+use super::people::Person;
 use super::problem::{Frame, Known, Settings};
 use super::state::{Carrier, State, Turns};
-use super::targets::Observation;
 use super::weighing::{fitness, total};
 use crate::body::Shape;
 use crate::math::order::quantile;
@@ -66,9 +66,9 @@ pub struct Hypothesis {
 }
 
 /// Track, heading and stature from the clouds.
-pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector3<f64>, floor_m: Option<f64>) -> Result<Track, FitError> {
-    let seen: Vec<&Observation> = observations.iter().filter(|o| o.cloud.points.len() >= FEWEST_POINTS).collect();
-    let nobody = || FitError::NobodySeen { frames: observations.len(), with_person: seen.len(), points: FEWEST_POINTS };
+pub fn track(people: &[Person], viewpoint: &Vector3<f64>, up: &Vector3<f64>, floor_m: Option<f64>) -> Result<Track, FitError> {
+    let seen: Vec<&Person> = people.iter().filter(|p| p.points().len() >= FEWEST_POINTS).collect();
+    let nobody = || FitError::NobodySeen { frames: people.len(), with_person: seen.len(), points: FEWEST_POINTS };
     if seen.len() < FEWEST_FRAMES {
         return Err(nobody());
     }
@@ -77,32 +77,32 @@ pub fn track(observations: &[Observation], viewpoint: &Vector3<f64>, up: &Vector
     let stature = (top - floor).clamp(1.2, 2.1);
     let horizontal = |v: Vector3<f64>| v - up * v.dot(up);
     let deeper = |x: Vector3<f64>| horizontal(x) + horizontal(x - viewpoint).normalize() * HALF_DEPTH_M;
-    let places: Vec<Vector3<f64>> = seen.iter().filter_map(|o| median(o)).map(deeper).collect();
-    let middle = seen.iter().map(|o| o.time_s).sum::<f64>() / seen.len() as f64;
-    let times: Vec<f64> = seen.iter().map(|o| o.time_s - middle).collect();
+    let places: Vec<Vector3<f64>> = seen.iter().filter_map(|p| median(p)).map(deeper).collect();
+    let middle = seen.iter().map(|p| p.time_s()).sum::<f64>() / seen.len() as f64;
+    let times: Vec<f64> = seen.iter().map(|p| p.time_s() - middle).collect();
     let coefficients = parabola(&times, &places).ok_or_else(nobody)?;
     let hip = up * (floor + Shape::template(stature).hip_height_m());
     let at = |t: f64| coefficients[0] + coefficients[1] * t + coefficients[2] * t * t + hip;
     Ok(Track {
         stature_m: stature,
         floor_m: floor,
-        positions: observations.iter().map(|o| at(o.time_s - middle)).collect(),
+        positions: people.iter().map(|p| at(p.time_s() - middle)).collect(),
         velocity: coefficients[1],
         up: *up,
     })
 }
 
 /// Heights of the lowest and highest point: quantiles of each cloud against stray points, then medians over the frames.
-fn extent(seen: &[&Observation], up: &Vector3<f64>) -> Option<(f64, f64)> {
+fn extent(seen: &[&Person], up: &Vector3<f64>) -> Option<(f64, f64)> {
     let middle = |q: f64| {
-        let of_cloud = |o: &&Observation| quantile(o.cloud.points.iter().map(|p| p.position.dot(up)).collect(), q);
+        let of_cloud = |p: &&Person| quantile(p.points().map(|p| p.position.dot(up)).collect(), q);
         quantile(seen.iter().filter_map(of_cloud).collect(), 0.5)
     };
     Some((middle(0.003)?, middle(0.997)?))
 }
 
-fn median(observation: &Observation) -> Option<Vector3<f64>> {
-    let along = |axis: usize| quantile(observation.cloud.points.iter().map(|p| p.position[axis]).collect(), 0.5);
+fn median(person: &Person) -> Option<Vector3<f64>> {
+    let along = |axis: usize| quantile(person.points().map(|p| p.position[axis]).collect(), 0.5);
     Some(Vector3::new(along(0)?, along(1)?, along(2)?))
 }
 

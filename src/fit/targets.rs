@@ -6,8 +6,9 @@ use std::sync::Arc;
 use image::GrayImage;
 use nalgebra::{Matrix3, Point2, Vector3};
 
+use super::people::Person;
 use super::problem::{Frame, Outside, Target};
-use crate::clouds::Cloud;
+use crate::clouds::{Cloud, CloudPoint};
 use crate::math::distance_field::DistanceField;
 use crate::rig::{Camera, Rig};
 
@@ -34,8 +35,8 @@ const FIELD_STEP_PX: usize = 2;
 const BORDER_PX: u32 = 3;
 
 /// Distances to the silhouettes of one frame.
-pub fn outsides(observation: &Observation, rig: &Rig) -> Vec<Outside> {
-    let masks = rig.cameras.iter().zip(observation.masks.iter());
+pub fn outsides(person: &Person, rig: &Rig) -> Vec<Outside> {
+    let masks = rig.cameras.iter().zip(person.masks.iter());
     let known = masks.filter_map(|(camera, mask)| mask.as_ref().map(|m| (camera, m)));
     known
         .map(|(camera, mask)| {
@@ -47,31 +48,24 @@ pub fn outsides(observation: &Observation, rig: &Rig) -> Vec<Outside> {
 }
 
 /// At most `points` cloud points and `rays` silhouette rays per camera, evenly chosen; the floor is at height `floor_m`.
-pub fn frame(
-    observation: &Observation,
-    rig: &Rig,
-    outsides: &Arc<Vec<Outside>>,
-    floor_m: Option<f64>,
-    points: usize,
-    rays: usize,
-) -> Frame {
+pub fn frame(person: &Person, rig: &Rig, outsides: &Arc<Vec<Outside>>, floor_m: Option<f64>, points: usize, rays: usize) -> Frame {
     let up = rig.up.direction();
     let lowest = floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M);
-    let mut targets = evenly(&thinned(&observation.cloud, |x| x.dot(&up) > lowest), points);
-    for (camera, mask) in rig.cameras.iter().zip(observation.masks.iter()) {
+    let mut targets = evenly(&thinned(person.points(), |x| x.dot(&up) > lowest), points);
+    for (camera, mask) in rig.cameras.iter().zip(person.masks.iter()) {
         if let Some(mask) = mask {
             targets.extend(evenly(&outline(mask), rays).iter().filter_map(|pixel| ray(camera, pixel)));
         }
     }
-    Frame { time_s: observation.time_s, targets, outsides: outsides.clone() }
+    Frame { time_s: person.time_s(), targets, outsides: outsides.clone() }
 }
 
 /// At most `points` of the cloud points that [`frame`] does not choose.
-pub fn left_out(observation: &Observation, rig: &Rig, floor_m: Option<f64>, points: usize) -> Frame {
-    let all = thinned(&observation.cloud, |x| x.dot(&rig.up.direction()) > floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M));
+pub fn left_out(person: &Person, rig: &Rig, floor_m: Option<f64>, points: usize) -> Frame {
+    let all = thinned(person.points(), |x| x.dot(&rig.up.direction()) > floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M));
     let chosen: Vec<usize> = evenly(&(0..all.len()).collect::<Vec<_>>(), points);
     let others: Vec<Target> = (0..all.len()).filter(|i| chosen.binary_search(i).is_err()).map(|i| all[i].clone()).collect();
-    Frame { time_s: observation.time_s, targets: evenly(&others, points), outsides: Arc::default() }
+    Frame { time_s: person.time_s(), targets: evenly(&others, points), outsides: Arc::default() }
 }
 
 fn evenly<T: Clone>(items: &[T], wanted: usize) -> Vec<T> {
@@ -82,9 +76,9 @@ fn evenly<T: Clone>(items: &[T], wanted: usize) -> Vec<T> {
 }
 
 /// Mean position and mean covariance of the points in each cube of [`VOXEL_M`].
-fn thinned(cloud: &Cloud, wanted: impl Fn(&Vector3<f64>) -> bool) -> Vec<Target> {
+fn thinned<'a>(points: impl Iterator<Item = &'a CloudPoint>, wanted: impl Fn(&Vector3<f64>) -> bool) -> Vec<Target> {
     let mut cubes: BTreeMap<[i64; 3], (Vector3<f64>, Matrix3<f64>, f64)> = BTreeMap::new();
-    for point in cloud.points.iter().filter(|p| wanted(&p.position)) {
+    for point in points.filter(|p| wanted(&p.position)) {
         let key = [0, 1, 2].map(|k| (point.position[k] / VOXEL_M).floor() as i64);
         let cube = cubes.entry(key).or_insert((Vector3::zeros(), Matrix3::zeros(), 0.0));
         cube.0 += point.position;
@@ -121,7 +115,6 @@ fn ray(camera: &Camera, pixel: &Point2<f64>) -> Option<Target> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clouds::CloudPoint;
 
     #[test]
     fn outline_of_a_rectangle_runs_along_its_edges() {
@@ -140,8 +133,8 @@ mod tests {
             confidence: 1.0,
             covariance: Matrix3::identity() * x,
         };
-        let cloud = Cloud { points: vec![point(0.004), point(0.012), point(0.5), point(2.0)] };
-        let targets = thinned(&cloud, |x| x.x < 1.0);
+        let points = [point(0.004), point(0.012), point(0.5), point(2.0)];
+        let targets = thinned(points.iter(), |x| x.x < 1.0);
         assert_eq!(targets.len(), 2);
         assert!(
             matches!(&targets[0], Target::Point { x, covariance } if (x.x - 0.008).abs() < 1e-12 && (covariance[(0, 0)] - 0.008).abs() < 1e-12)

@@ -1,18 +1,20 @@
 //! How sure the fit is: covariance of all unknowns and of the joints' positions, from residuals as they are.
 //!
+//! The fit weighs its residuals with less than their precision, so that limbs unlike the model's do not bend it, and its errors
+//! are not those of its normal equations A = Jᵀ W J + P. With V the variances that the residuals have, and the truth spread about
+//! the priors as P says, the gradient at the truth has covariance B, and the solution
+//!   Σ = A⁻¹ B A⁻¹ + m² Σ_n g_n g_nᵀ,  B = Jᵀ W V W J + P;   A⁻¹ B A⁻¹ = −d/dh (A + h B)⁻¹ at h = 0.                (1)
+//! Of the inverses only the blocks of one frame and of the shared unknowns are formed (selected inversion), so time and
+//! memory are linear in the number of frames; the derivative is taken numerically, to six digits.
 //! Neighbouring points share correlation windows and the same misfit of the body's skin, so N residuals are not N
 //! measurements. With z_i the normalised residuals and clusters c of those on one node in one frame, the share of each
 //! residual that is new information is
-//!   s = Σ ω_i / Σ_c (Σ_{i∈c} ω_i z_i)²,                                                                         (1)
-//! the factor at which the variance that the least-squares fit believes its scores to have equals the variance that
-//! they show (a cluster-robust "sandwich" with one factor per kind of residual); points and rays have one each. The
-//! misfit of the skin is what the residuals show beyond the points' own covariance. The priors enter as they are:
-//!   Σ = (Σ_kinds s Jᵀ W J + P)⁻¹ + m² Σ_n g_n g_nᵀ.                                                             (2)
-//! The second term: a misfit m that stays with the skin of node n in all frames is averaged out by no number of them; g_n is
-//! how far it moves the solution (consider covariance; G. Bierman, Factorization methods, 1977). Half of its variance is
-//! common to all nodes, as clothes are and noise that takes points off thin limbs, and moves the solution by Σ_n g_n.
-//! Of the inverse only the blocks of one frame and of the shared unknowns are formed (selected inversion), so time and
-//! memory are linear in the number of frames. A joint at x moves by J δ, hence its covariance is J Σ Jᵀ.
+//!   s = Σ ω_i / Σ_c (Σ_{i∈c} ω_i z_i)²,  V_i = (nᵀ Σ_i n + m²) / s,                                             (2)
+//! one for points and one for rays: what makes the scores' variance the one that they show (a cluster-robust "sandwich"). m is
+//! the misfit of the skin, what the residuals show beyond the points' own covariance.
+//! The second term of (1): a misfit m that stays with the skin of node n in all frames is averaged out by no number of them; g_n is
+//! how far it moves the solution (consider covariance; G. Bierman, Factorization methods, 1977).
+//! A joint at x moves by J δ, hence its covariance is J Σ Jᵀ.
 //! What is not in it: joint centres of another convention, and motions that differ from all subjects of the database.
 //! Checked against the dense inverse, and by the coverage of its intervals over repeated noise.
 
@@ -25,6 +27,7 @@ use super::state::{LOCAL, Motion, State};
 use super::weighing::Frozen;
 use crate::body::{NODES, Surface};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
+use crate::math::banded::{BandCholesky, BandMatrix};
 use crate::math::order::quantile;
 
 /// Standard deviations of one frame.
@@ -50,30 +53,25 @@ pub struct Uncertainty {
 
 /// Fewer residuals than this say nothing about their own variance.
 const FEWEST: f64 = 100.0;
-/// Least misfit of any body model, metres: what the fit itself is off by on bodies of its own kind (`bench coverage`).
-const LEAST_MISFIT_M: f64 = 0.0015;
+/// Least misfit of any body model, metres: by what widths are off on bodies of its own kind (`bench coverage`).
+const LEAST_MISFIT_M: f64 = 0.0005;
+/// Of no kind of residual less is new.
+const LEAST_SHARE: f64 = 1e-3;
+/// Step of the derivative in equation (1).
+const STEP: f64 = 1e-3;
 
 /// Uncertainty at a solution found with `settings`; `None` where the equations are singular.
 pub fn uncertainty(curve: &Curve, frames: &[Frame], settings: &Settings, free: Free, known: &Known, state: &State) -> Option<Uncertainty> {
-    let misfit_m = misfit_m(&Problem::new(curve, frames, settings, free, known, state));
-    let believed = Settings { model_m: misfit_m, point_weight: 1.0, ray_weight: 1.0, ..settings.clone() };
-    let shares = {
-        let frozen = Problem::new(curve, frames, &believed, free, known, state);
-        [true, false].map(|points| share(frozen.frozen().iter().map(|f| f.iter().filter(|f| f.is_point == points))))
-    };
-    let measured = Settings { point_weight: shares[0], ray_weight: shares[1], ..believed };
-    let problem = Problem::new(curve, frames, &measured, free, known, state);
-    let (shared, frames) = propagate(&problem.linearise(state), &misfits(problem.skin_pulls(state), misfit_m), curve, state)?;
+    let problem = Problem::new(curve, frames, settings, free, known, state);
+    let misfit_m = misfit_m(&problem);
+    let of_kind = |points| problem.frozen().iter().map(move |f| f.iter().filter(move |f| f.is_point == points));
+    let shares = [true, false].map(|points| share(of_kind(points), misfit_m));
+    let pulls = problem.skin_pulls(state) * misfit_m;
+    let normal = problem.linearise(state);
+    let shown = |f: &Frozen| f.weight.powi(2) * (f.variance + misfit_m.powi(2)) / shares[usize::from(!f.is_point)];
+    let scores = problem.reweighted(shown).linearise(state);
+    let (shared, frames) = propagate(&normal, &scores, &pulls, curve, state)?;
     Some(Uncertainty { shared, frames, shares, misfit_m })
-}
-
-/// Pulls of skin that is off by a standard deviation: of each node by itself, and of all together.
-fn misfits(pulls: DMatrix<f64>, misfit_m: f64) -> DMatrix<f64> {
-    let common = pulls.column_sum();
-    let nodes = pulls.ncols();
-    let mut all = pulls.insert_column(nodes, 0.0);
-    all.set_column(nodes, &common);
-    all * (misfit_m * std::f64::consts::FRAC_1_SQRT_2)
 }
 
 /// What the median point's distance shows beyond its own standard deviation along the normal.
@@ -84,58 +82,91 @@ fn misfit_m(problem: &Problem) -> f64 {
     (spread * spread - median(points().map(|f| f.variance).collect())).max(0.0).sqrt().max(LEAST_MISFIT_M)
 }
 
-/// Equation (1) over frames of residuals.
-fn share<'a, F: Iterator<Item = &'a Frozen>>(frames: impl Iterator<Item = F>) -> f64 {
+/// Equation (2) over frames of residuals.
+fn share<'a, F: Iterator<Item = &'a Frozen>>(frames: impl Iterator<Item = F>, misfit_m: f64) -> f64 {
     let (mut believed, mut shown) = (0.0, 0.0);
     for frame in frames {
         let mut sums = [0.0; NODES];
         for f in frame {
             believed += f.robust;
-            sums[f.node as usize] += f.robust * f.distance_m / f.sigma_m;
+            sums[f.node as usize] += f.robust * f.distance_m / (f.variance + misfit_m.powi(2)).sqrt();
         }
         shown += sums.iter().map(|s| s * s).sum::<f64>();
     }
-    if believed < FEWEST { 0.0 } else { (believed / shown.max(believed * 1e-3)).min(1.0) }
+    if believed < FEWEST { LEAST_SHARE } else { (believed / shown).clamp(LEAST_SHARE, 1.0) }
+}
+
+/// The inverse of normal equations in the parts that are asked for.
+struct Inverse {
+    factor: BandCholesky,
+    /// K⁻¹ B.
+    eliminated: DMatrix<f64>,
+    shared: DMatrix<f64>,
+}
+
+impl Inverse {
+    fn of(normal: &NormalEquations) -> Option<Inverse> {
+        let factor = normal.local.cholesky()?;
+        let eliminated = factor.solve(&normal.border);
+        let shared = (&normal.shared - normal.border.tr_mul(&eliminated)).cholesky()?.inverse();
+        Some(Inverse { factor, eliminated, shared })
+    }
+
+    /// How the solution gives way to pulls on it, a column each: the frames' unknowns, the shared ones.
+    fn way(&self, pulls: &DMatrix<f64>) -> [DMatrix<f64>; 2] {
+        let locals = self.eliminated.nrows();
+        let own = pulls.rows(0, locals).into_owned();
+        let shared = &self.shared * (pulls.rows(locals, self.shared.nrows()) - self.eliminated.tr_mul(&own));
+        [self.factor.solve(&own) - &self.eliminated * &shared, shared]
+    }
+
+    /// Covariance of the unknowns of the frame that begins with unknown `first`, then the shared ones; `band` is the selected inverse.
+    fn covariance(&self, band: &BandMatrix, first: usize, local: usize) -> DMatrix<f64> {
+        let through = self.eliminated.rows(first, local);
+        let across = -(through * &self.shared);
+        let own = DMatrix::from_fn(local, local, |i, j| band.get(first + i, first + j)) - &across * through.transpose();
+        let size = local + self.shared.nrows();
+        DMatrix::from_fn(size, size, |i, j| match (i < local, j < local) {
+            (true, true) => own[(i, j)],
+            (true, false) => across[(i, j - local)],
+            (false, true) => across[(j, i - local)],
+            (false, false) => self.shared[(i - local, j - local)],
+        })
+    }
 }
 
 /// The covariance of the shared unknowns, and what follows for each frame; `pulls` are those of skin that is off.
 fn propagate(
     normal: &NormalEquations,
+    scores: &NormalEquations,
     pulls: &DMatrix<f64>,
     curve: &Curve,
     state: &State,
 ) -> Option<(DMatrix<f64>, Vec<FrameUncertainty>)> {
-    let factor = normal.local.cholesky()?;
-    let eliminated = factor.solve(&normal.border);
-    let shared = (&normal.shared - normal.border.tr_mul(&eliminated)).cholesky()?.inverse();
-    let inverse = factor.selected_inverse();
-    let locals = eliminated.nrows();
-    // How the solution gives way to the pulls: shared unknowns, then the frames'.
-    let way_shared = &shared * (pulls.rows(locals, shared.nrows()) - eliminated.tr_mul(&pulls.rows(0, locals)));
-    let way = factor.solve(&pulls.rows(0, locals).into_owned()) - &eliminated * &way_shared;
+    let [way, way_shared] = Inverse::of(normal)?.way(pulls);
+    let [less, more] = [-STEP, STEP].map(|h| Inverse::of(&normal.plus(h, scores)));
+    let (less, more) = (less?, more?);
+    let (band_less, band_more) = rayon::join(|| less.factor.selected_inverse(), || more.factor.selected_inverse());
     let surface = Surface::new(&state.shape);
     let layout = state.layout();
     let of_frame = |t: usize| {
         let first = t * layout.local;
-        let block = DMatrix::from_fn(layout.local, layout.local, |i, j| inverse.get(first + i, first + j));
-        let through = eliminated.rows(first, layout.local).into_owned();
-        let own_way = way.rows(first, layout.local);
-        let whole = &block + &through * &shared * through.transpose() + own_way * own_way.transpose();
+        let solved = less.covariance(&band_less, first, layout.local) - more.covariance(&band_more, first, layout.local);
+        let mut moved = DMatrix::zeros(layout.size(), pulls.ncols());
+        moved.rows_mut(0, layout.local).copy_from(&way.rows(first, layout.local));
+        moved.rows_mut(layout.local, layout.shared()).copy_from(&way_shared);
+        let covariance = solved / (2.0 * STEP) + &moved * moved.transpose();
         let motion = state.motion(curve, &surface, t);
         let placement = state.posed(curve, &surface, t).placement;
         let joints_m = std::array::from_fn(|node| {
             let jacobian = position_jacobian(&motion, state, t, node, &placement.positions[node]);
-            let local = jacobian.columns(0, layout.local);
-            let (direct, moved) = (jacobian.columns(layout.local, layout.shared()), local * own_way);
-            let rest = direct - local * &through;
-            let moved = moved + direct * &way_shared;
-            let covariance = local * &block * local.transpose() + &rest * &shared * rest.transpose() + &moved * moved.transpose();
-            Vector3::from_fn(|axis, _| covariance[(axis, axis)].max(0.0).sqrt())
+            let of_joint = &jacobian * &covariance * jacobian.transpose();
+            Vector3::from_fn(|axis, _| of_joint[(axis, axis)].max(0.0).sqrt())
         });
-        FrameUncertainty { local: std::array::from_fn(|i| whole[(i, i)].max(0.0).sqrt()), joints_m }
+        FrameUncertainty { local: std::array::from_fn(|i| covariance[(i, i)].max(0.0).sqrt()), joints_m }
     };
     let frames = (0..state.carriers.len()).into_par_iter().map(of_frame).collect();
-    let shared = shared + &way_shared * way_shared.transpose();
+    let shared = (less.shared - more.shared) / (2.0 * STEP) + &way_shared * way_shared.transpose();
     Some((shared, frames))
 }
 
@@ -190,47 +221,50 @@ mod tests {
         let state = state();
         let frames = crate::fit::problem::tests::frames(&curve, &state);
         let problem = Problem::new(&curve, &frames, &SETTINGS, ALL, &KNOWN, &state);
-        let (normal, pulls) = (problem.linearise(&state), misfits(problem.skin_pulls(&state), 0.003));
-        let (shared, found) = propagate(&normal, &pulls, &curve, &state).unwrap();
+        let (normal, pulls) = (problem.linearise(&state), problem.skin_pulls(&state) * 0.003);
+        let scores = problem.reweighted(|f| 0.3 * f.weight).linearise(&state);
+        let (shared, found) = propagate(&normal, &scores, &pulls, &curve, &state).unwrap();
         let (locals, layout) = (normal.local_gradient.len(), state.layout());
-        let dense = DMatrix::from_fn(locals + layout.shared(), locals + layout.shared(), |i, j| match (i < locals, j < locals) {
-            (true, true) => normal.local.get(i.max(j), i.min(j)),
-            (true, false) => normal.border[(i, j - locals)],
-            (false, true) => normal.border[(j, i - locals)],
-            (false, false) => normal.shared[(i - locals, j - locals)],
-        });
-        let inverse = dense.try_inverse().unwrap();
+        let dense = |normal: &NormalEquations| {
+            DMatrix::from_fn(locals + layout.shared(), locals + layout.shared(), |i, j| match (i < locals, j < locals) {
+                (true, true) => normal.local.get(i.max(j), i.min(j)),
+                (true, false) => normal.border[(i, j - locals)],
+                (false, true) => normal.border[(j, i - locals)],
+                (false, false) => normal.shared[(i - locals, j - locals)],
+            })
+        };
+        let inverse = dense(&normal).try_inverse().unwrap();
         let way = &inverse * &pulls;
-        let covariance = inverse + &way * way.transpose();
+        let covariance = &inverse * dense(&scores) * &inverse + &way * way.transpose();
         let scale = |i: usize, j: usize| (covariance[(i, i)] * covariance[(j, j)]).sqrt();
         for i in 0..layout.shared() {
             for j in 0..layout.shared() {
                 let (a, b) = (locals + i, locals + j);
-                assert!((shared[(i, j)] - covariance[(a, b)]).abs() < 1e-6 * scale(a, b), "{i} {j}");
+                assert!((shared[(i, j)] - covariance[(a, b)]).abs() < 1e-5 * scale(a, b), "{i} {j}");
             }
         }
         let surface = Surface::new(&state.shape);
         for (t, frame) in found.iter().enumerate() {
             for k in 0..LOCAL {
                 let at = layout.local * t + k;
-                assert!((frame.local[k] / covariance[(at, at)].sqrt() - 1.0).abs() < 1e-6, "{t} {k}");
+                assert!((frame.local[k] / covariance[(at, at)].sqrt() - 1.0).abs() < 1e-5, "{t} {k}");
             }
             let (motion, x) = (state.motion(&curve, &surface, t), state.posed(&curve, &surface, t).placement.positions);
             let own: Vec<usize> = (0..layout.local).map(|k| layout.local * t + k).chain(locals..locals + layout.shared()).collect();
             let block = DMatrix::from_fn(own.len(), own.len(), |i, j| covariance[(own[i], own[j])]);
             let jacobian = position_jacobian(&motion, &state, t, 12, &x[12]);
             let expected = &jacobian * block * jacobian.transpose();
-            assert!((0..3).all(|axis| (frame.joints_m[12][axis] / expected[(axis, axis)].sqrt() - 1.0).abs() < 1e-6));
+            assert!((0..3).all(|axis| (frame.joints_m[12][axis] / expected[(axis, axis)].sqrt() - 1.0).abs() < 1e-5));
         }
     }
 
     #[test]
     fn correlated_residuals_are_worth_less() {
-        let frozen = |node: u8, z: f64| Frozen { node, robust: 1.0, distance_m: z, sigma_m: 1.0, is_point: true, ..Frozen::default() };
+        let frozen = |node: u8, z: f64| Frozen { node, robust: 1.0, distance_m: z, variance: 1.0, is_point: true, ..Frozen::default() };
         let waves: Vec<f64> = (0..400).map(|i| (1.7 * (i * i) as f64).sin() * std::f64::consts::SQRT_2).collect();
         let alone: Vec<Vec<Frozen>> = waves.iter().map(|z| vec![frozen(3, *z)]).collect();
-        assert!((share(alone.iter().map(|f| f.iter())) - 1.0).abs() < 0.1);
+        assert!((share(alone.iter().map(|f| f.iter()), 0.0) - 1.0).abs() < 0.1);
         let fivefold: Vec<Vec<Frozen>> = waves.iter().map(|z| vec![frozen(3, *z); 5]).collect();
-        assert!((share(fivefold.iter().map(|f| f.iter())) - 0.2).abs() < 0.02);
+        assert!((share(fivefold.iter().map(|f| f.iter()), 0.0) - 0.2).abs() < 0.02);
     }
 }

@@ -36,6 +36,16 @@ impl NormalEquations {
         }
     }
 
+    /// The matrices of self + `factor` `other`, without gradients.
+    pub fn plus(&self, factor: f64, other: &NormalEquations) -> NormalEquations {
+        NormalEquations {
+            local: self.local.plus(factor, &other.local),
+            border: &self.border + factor * &other.border,
+            shared: &self.shared + factor * &other.shared,
+            ..NormalEquations::zeros(0, 0, 0)
+        }
+    }
+
     /// The step (y, z) of equation (1) with the diagonal scaled by 1 + `damping`; `None` if singular.
     pub fn step(&self, damping: f64) -> Option<(DVector<f64>, DVector<f64>)> {
         let mut local = self.local.clone();

@@ -43,6 +43,12 @@ impl BandMatrix {
         self.rows[index] += value;
     }
 
+    /// self + `factor` `other`, of the same size and bandwidth.
+    pub fn plus(&self, factor: f64, other: &BandMatrix) -> BandMatrix {
+        let rows = self.rows.iter().zip(&other.rows).map(|(a, b)| a + factor * b).collect();
+        BandMatrix { rows, ..*self }
+    }
+
     /// Makes row and column `i` those of the identity.
     pub fn isolate(&mut self, i: usize) {
         for other in i.saturating_sub(self.bandwidth)..(i + self.bandwidth + 1).min(self.size) {

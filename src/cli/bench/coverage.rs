@@ -1,15 +1,15 @@
 //! `muybridge bench coverage`: do the fit's 95 % intervals hold the truth 95 times in 100?
 //!
 //! People drawn from the model and the fit's own priors, so that nothing but noise is between fit and truth; every repeat
-//! has noise of its own. Their carriers accelerate as the priors expect, less the slow part (a cubic over the walk), which would
-//! turn them out of their way; `--gliding` people do not accelerate at all and are easier than the fit believes. An interval is
-//! the estimate ± 1.96 σ.
+//! has noise of its own. Their joints leave the model and their carriers accelerate as the priors expect, the latter less the slow
+//! part (a cubic over the walk), which would turn them out of their way; `--gliding` people do neither and are easier than the fit
+//! believes. An interval is the estimate ± 1.96 σ.
 
 use anyhow::{Context, Result};
 use clap::Args;
 use muybridge::body::{Joint, Length, Pose, Shape, Surface, place};
 use muybridge::fit::curve::Curve;
-use muybridge::fit::state::{Carrier, State, Turns};
+use muybridge::fit::state::{Carrier, DEVIATING, State, Turns};
 use muybridge::fit::{Fit, FitOptions, SETTINGS};
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, Model};
@@ -36,7 +36,7 @@ pub struct CoverageArgs {
     /// Follow the model exactly, without turns of single joints
     #[arg(long)]
     no_deviations: bool,
-    /// People who glide with constant speed, heading and cadence
+    /// People who move as the model, with constant speed, heading and cadence
     #[arg(long)]
     gliding: bool,
 }
@@ -144,7 +144,15 @@ impl Person {
             }
         };
         let carriers = (0..FRAMES).map(carrier).collect();
-        let state = State { carriers, weights, shape, posture: Turns::default(), deviations: Vec::new() };
+        let mut state = State { carriers, weights, shape, posture: Turns::default(), deviations: Vec::new() };
+        if !gliding {
+            state.deviations = vec![Turns::default(); FRAMES];
+            for (joint, axis) in (0..DEVIATING.len()).flat_map(|joint| (0..3).map(move |axis| (joint, axis))) {
+                state.posture[joint][axis] = SETTINGS.posture * normal(&mut rng);
+                let turns = deviation(&mut rng);
+                state.deviations.iter_mut().zip(turns.iter()).for_each(|(of_frame, turn)| of_frame[joint][axis] = *turn);
+            }
+        }
         let poses: Vec<Pose> = (0..FRAMES).map(|t| state.pose(&curve, t)).collect();
         let (surface, offsets) = (Surface::new(&state.shape), state.shape.offsets());
         let floor_m = poses.iter().map(|p| staging::lowest_m(&surface, &place(&offsets, p), rig.up)).fold(f64::INFINITY, f64::min);
@@ -177,12 +185,21 @@ fn wobble(sigma: f64, rng: &mut ChaCha8Rng) -> Vec<f64> {
     (&walk - &slow * slow.tr_mul(&walk)).iter().copied().collect()
 }
 
-/// A standard normal number within 2 standard deviations.
+/// Turns of a joint about one axis, one per frame, rad: likely as the priors of their size and acceleration say.
+fn deviation(rng: &mut ChaCha8Rng) -> DVector<f64> {
+    let second = FPS * FPS / SETTINGS.turn_acceleration;
+    let bend = DMatrix::from_fn(FRAMES - 2, FRAMES, |t, k| second * [1.0, -2.0, 1.0].get(k.wrapping_sub(t)).unwrap_or(&0.0));
+    let precision = bend.tr_mul(&bend) + DMatrix::identity(FRAMES, FRAMES) / SETTINGS.deviation.powi(2);
+    let drawn = DVector::from_fn(FRAMES, |_, _| normal(rng));
+    precision.cholesky().and_then(|factor| factor.l().tr_solve_lower_triangular(&drawn)).unwrap_or_else(|| DVector::zeros(FRAMES))
+}
+
+/// A standard normal number within 3 standard deviations.
 fn normal(rng: &mut ChaCha8Rng) -> f64 {
     loop {
         let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
         let drawn = radius * (std::f64::consts::TAU * rng.random::<f64>()).cos();
-        if drawn.abs() < 2.0 {
+        if drawn.abs() < 3.0 {
             return drawn;
         }
     }
