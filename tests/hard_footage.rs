@@ -170,8 +170,7 @@ fn ten_frames_without_the_person_are_bridged() {
 
 #[test]
 fn somebody_in_the_background_does_not_take_over() {
-    // Points of others are left out, their outlines are not.
-    assert!(off_m(&track(&film().child)) < 0.04);
+    assert!(off_m(&track(&film().child)) < 0.02);
 }
 
 #[test]

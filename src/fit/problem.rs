@@ -612,7 +612,7 @@ pub(super) mod tests {
         let frames = frames(&curve, &state);
         let settings = Settings { residual, ..SETTINGS };
         let problem = Problem::new(&curve, &frames, &settings, ALL, &KNOWN, &state);
-        assert_eq!(problem.frozen.iter().flatten().any(|f| f.offset_m.abs() > 1e-3), residual == PointResidual::Ray);
+        assert_eq!(problem.frozen.iter().flatten().any(|f| f.is_point && f.offset_m.abs() > 1e-3), residual != PointResidual::Field);
         let layout = state.layout();
         let motion = state.motion(&curve, &Surface::new(&state.shape), 1);
         for frozen in &problem.frozen[1] {

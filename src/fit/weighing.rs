@@ -27,9 +27,8 @@ pub struct Frozen {
     pub weight: f64,
     /// κ_i.
     pub metres_per_root: f64,
-    /// Signed distance, the standard deviation that it is believed to have, and the target's own variance in it, m and m².
+    /// Signed distance and the target's own variance in it, m and m².
     pub distance_m: f64,
-    pub sigma_m: f64,
     pub variance: f64,
     /// Cauchy weight, 0 to 1.
     pub robust: f64,
@@ -150,7 +149,6 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
             x: at,
             near,
             metres_per_root: evaluation.metres_per_root(),
-            sigma_m: precision.sqrt().recip(),
             variance,
             node: nearest.map_or(0, |share| surface.primitives[share.primitive].node as u8),
             is_point,
@@ -257,6 +255,7 @@ fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluatio
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::body::{Joint, Pose, Shape, place};
     use crate::fit::curve::tests::made_up_model;
     use crate::fit::problem::tests::{KNOWN, SETTINGS, frames, state};
 
@@ -276,6 +275,27 @@ mod tests {
                     (0..8000).map(|i| surface.evaluate(&(origin + direction * (i as f64 * 1e-3))).d_eff).fold(f64::INFINITY, f64::min);
                 assert!(surface.evaluate(&found).d_eff < dense + 0.02, "{} {dense}", surface.evaluate(&found).d_eff);
             }
+        }
+    }
+
+    #[test]
+    fn feet_are_on_the_skin_and_the_distance_is_the_way_there() {
+        let surface = PosedSurface::new(
+            &Surface::ball(Joint::Root, 0.05),
+            &place(&Shape::template(1.7).offsets(), &Pose::rest(Vector3::new(0.0, 4.0, 1.0))),
+        );
+        let centre = surface.primitives[0].centre;
+        let along = [Vector3::x(), -Vector3::z(), Vector3::new(1.0, 1.0, -0.5).normalize()];
+        let distances = [-0.012, -0.004, 0.004, 0.03, 0.1];
+        let points = along.iter().flat_map(|n| distances.map(|d| centre + n * (0.05 + d)));
+        let targets = points.map(|x| Target::Point { x, covariance: nalgebra::Matrix3::zeros() }).collect();
+        let frozen = freeze(&Frame { targets, ..Frame::default() }, &surface, &SETTINGS, &KNOWN).0;
+        for (k, f) in frozen.iter().enumerate() {
+            let (n, d) = (along[k / distances.len()], distances[k % distances.len()]);
+            assert!((f.distance_m - d).abs() < 1e-6, "{} {d}", f.distance_m);
+            // Beyond two of the longest steps the derivative is that of a point outside.
+            let foot = centre + n * (0.05 + (d - 2.0 * TO_SKIN_M).max(0.0));
+            assert!((f.x - foot).norm() < 1e-6, "{:?} {foot:?}", f.x);
         }
     }
 

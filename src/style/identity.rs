@@ -3,12 +3,13 @@
 //! Of a motion vector Ψ only the joints J that footage shows count, and a constant of each of their axes c is the business
 //! of skeletons and marker sets as much as the person's:
 //!   Ψ_J = Θ0_J + Θ_J α + c + ε,   c ~ N(0, σ_c²),   ε ~ N(0, σ_j²) at N_e independent samples of the cycle.          (1)
-//! A subject's weights are N(α_p(s), (1 + 1/k) W) about its curve at the parameter s, W the spread of all subjects' k
-//! cycles about their curves; a stranger's are the population's N(0, Λ). For each subject
+//! A subject's weights at the parameter s are N(ᾱ_p + β (s − s̄_p), (1 + 1/k) W): the mean of its k cycles, moved as within all
+//! subjects the weights change with the parameter on average, β, and W the spread of all cycles about that; a stranger's
+//! are the population's N(0, Λ). For each subject
 //!   log odds = ln ∫ p(Ψ_J|α) p(α|subject) dα − ln ∫ p(Ψ_J|α) p(α|stranger) dα.                                       (2)
 //! Departure: equation (6) of the style paper weighs a weight by its λ². The first weights of marker sets hold how wrists
 //! and heads were marked, so between a tracked person and recordings it compares what two skeletons do not share.
-//! Fails when nobody of the database has two cycles at one parameter: then W is not known.
+//! Fails when nobody of the database has two cycles: then W is not known.
 //! Checked against the densities written out, and on people with cycles in the database and without.
 
 use nalgebra::{DMatrix, DVector};
@@ -46,20 +47,71 @@ struct Information {
     pull: DVector<f64>,
 }
 
-/// Equation (2) for the subjects of `population` that move at `parameter`, in its order, with `vector` the motion Ψ;
+/// Equation (2) for the subjects of the model, in the order of `population`, with `vector` the motion Ψ at `parameter`;
 /// `None` where W is not known.
 pub fn log_odds(population: &Population, model: &Model, vector: &DVector<f64>, parameter: f64) -> Option<Vec<(String, f64)>> {
     let count = population.components();
     let information = information(model, vector, count);
-    let spread = within(population, model)?;
+    let subjects = Subjects::of(population, model)?;
     let stranger = DMatrix::from_diagonal(&DVector::from_column_slice(&population.eigenvalues));
     let against = evidence(&information, &DVector::zeros(count), &stranger)?;
-    let of_subject = |curve: &super::curves::Curve| {
-        let cycles = model.members.iter().filter(|m| m.subject == curve.subject).count() as f64;
-        let found = evidence(&information, &population.extended(curve, parameter), &(&spread * (1.0 + 1.0 / cycles)))?;
-        Some((curve.subject.clone(), found - against))
+    let of_subject = |(name, own): (&String, &Centre)| {
+        let mean = &own.weights + &subjects.change * (parameter - own.parameter);
+        let found = evidence(&information, &mean, &(&subjects.spread * (1.0 + 1.0 / own.cycles)))?;
+        Some((name.clone(), found - against))
     };
-    population.present(parameter).map(of_subject).collect()
+    subjects.names.iter().zip(&subjects.centres).map(of_subject).collect()
+}
+
+/// The mean of one subject's cycles.
+struct Centre {
+    cycles: f64,
+    parameter: f64,
+    weights: DVector<f64>,
+}
+
+/// ᾱ_p, β and W.
+struct Subjects {
+    names: Vec<String>,
+    centres: Vec<Centre>,
+    change: DVector<f64>,
+    spread: DMatrix<f64>,
+}
+
+impl Subjects {
+    fn of(population: &Population, model: &Model) -> Option<Subjects> {
+        let count = population.components();
+        let basis = model.basis.columns(0, count);
+        let names: Vec<String> = population.curves.iter().map(|curve| curve.subject.clone()).collect();
+        let own = |name: &String| -> Vec<(f64, DVector<f64>)> {
+            let members = model.members.iter().filter(|m| m.subject == *name);
+            members.map(|m| (m.parameter, basis.tr_mul(&(&m.vector - &model.mean)))).collect()
+        };
+        let cycles: Vec<Vec<(f64, DVector<f64>)>> = names.iter().map(own).collect();
+        let centre = |own: &Vec<(f64, DVector<f64>)>| {
+            let cycles = own.len() as f64;
+            let sum = own.iter().fold((0.0, DVector::zeros(count)), |sum, c| (sum.0 + c.0, sum.1 + &c.1));
+            Centre { cycles, parameter: sum.0 / cycles, weights: sum.1 / cycles }
+        };
+        let centres: Vec<Centre> = cycles.iter().map(centre).collect();
+        let about = || cycles.iter().zip(&centres).flat_map(|(own, c)| own.iter().map(move |(s, a)| (s - c.parameter, a - &c.weights)));
+        let travelled: f64 = about().map(|(s, _)| s * s).sum();
+        let mut change = DVector::zeros(count);
+        if travelled > 0.0 {
+            about().for_each(|(s, off)| change += off * (s / travelled));
+        }
+        let free: f64 = centres.iter().map(|c| c.cycles - 1.0).sum();
+        let mut spread = DMatrix::zeros(count, count);
+        for (s, off) in about() {
+            let off = off - &change * s;
+            spread += &off * off.transpose();
+        }
+        (free > 0.0).then(|| {
+            spread /= free;
+            (0..count).for_each(|i| spread[(i, i)] += RIDGE * spread[(i, i)] + 1e-9 * population.eigenvalues[i]);
+            Subjects { names, centres, change, spread }
+        })
+    }
 }
 
 /// Equation (1) with c eliminated: what varies of each axis, and its constant with variance σ_c².
@@ -80,27 +132,6 @@ fn information(model: &Model, vector: &DVector<f64>, count: usize) -> Informatio
         }
     }
     found
-}
-
-/// W: pooled spread of the subjects' cycles about their curves.
-fn within(population: &Population, model: &Model) -> Option<DMatrix<f64>> {
-    let count = population.components();
-    let basis = model.basis.columns(0, count);
-    let (mut sum, mut free) = (DMatrix::zeros(count, count), 0.0);
-    for curve in &population.curves {
-        let own = model.members.iter().filter(|m| m.subject == curve.subject);
-        free -= curve.parameters().len() as f64;
-        for member in own {
-            let off = basis.tr_mul(&(&member.vector - &model.mean)) - population.extended(curve, member.parameter);
-            sum += &off * off.transpose();
-            free += 1.0;
-        }
-    }
-    (free > 0.0).then(|| {
-        sum /= free;
-        (0..count).for_each(|i| sum[(i, i)] += RIDGE * sum[(i, i)] + 1e-9 * population.eigenvalues[i]);
-        sum
-    })
 }
 
 /// ln ∫ exp(−½ αᵀ I α + bᵀ α) N(α; mean, covariance) dα; `None` where the covariance is singular.
