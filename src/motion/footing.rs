@@ -6,9 +6,10 @@
 //!   min ∫ Σ_k (c_k u_k² + τ_k⁴ ü_k²) + Σ_i w_i (ẋ_i² + ż_i²)/σ_v² + Σ_i v_i (y_i − y_i*)²/σ_y² dt                 (1)
 //! During a contact w_i = b(h_i/h0), h_i the height over the foot's lowest point and b(r) = (1 − r²)²: the heel stands first,
 //! then all of the foot, then ball and toe tip while the foot turns about its toes; who touches with the tip alone may pivot
-//! on it. v_i = b(height over the floor/h1): feet come down where they did, y_i* being the own height, or the floor's where that is
-//! close in the midst of a contact. c_k is 1, and `FREE` squared for a leg that does
-//! not stand. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
+//! on it. v_i = b(height over the floor/h1): feet come down where they did. y_i* is the own height, in the midst of a contact
+//! the floor's where the point is under or little over it: the toes of recordings flutter there, and a toe that turns drags the
+//! ball along. c_k is 1, and `FREE` squared for a leg that does not stand. Everything is a difference of neighbouring frames, so
+//! the equations are a band of three frames.
 //! Checked against central differences.
 
 use std::ops::Range;
