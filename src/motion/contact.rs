@@ -4,7 +4,7 @@
 //! foot that rolls from heel to toe stands still at each moment where it touches, and the slide from one frame to the next is
 //!   s = Σ_i w_i Δp_i                                                                                               (1)
 //! Recorded feet are tilted against the template's by unknown angles: each point is moved along its foot's vertical so that
-//! it is on the floor in the median of those frames in which it is slow.
+//! it is on the floor in the median of those frames in which it is slow. Who is under the floor is on it.
 //! A foot stands where its lowest point is near the floor and (1) is slow against the person's travel.
 //! Fails when: a sole is dragged over the floor as fast as the person goes; that is no stance.
 //! Checked against soles that slide at known speeds and the durations of stance that are published for walking and running.
@@ -13,7 +13,7 @@ use std::ops::Range;
 
 use nalgebra::Vector3;
 
-use crate::body::{Clip, Joint};
+use crate::body::{Clip, Joint, Placement};
 use crate::math::order::quantile;
 
 /// σ of the weights, metres. Smaller hands over from heel to ball within a frame, larger lets lifted heels count.
@@ -39,26 +39,28 @@ pub struct FootTrack {
     pub ankles: Vec<Vector3<f64>>,
     /// Heel, ball and toe tip, see [`Clip::sole_points`], on the floor while they rest.
     pub soles: Vec<[Vector3<f64>; 3]>,
+    /// How far they were moved down for that, metres.
+    down_m: [f64; 3],
 }
 
 impl FootTrack {
     /// Of the foot of `ankle`, LAnkle or RAnkle.
     pub fn new(clip: &Clip, ankle: Joint) -> FootTrack {
-        let mut track = FootTrack { ankle, ankles: Vec::new(), soles: Vec::new() };
-        let ball = if ankle == Joint::LAnkle { Joint::LMidtarsal } else { Joint::RMidtarsal };
-        let mut ups: Vec<[Vector3<f64>; 3]> = Vec::new();
-        for pose in &clip.poses {
-            let placed = clip.place(pose);
-            let up = |joint: Joint| placed.world_from_node[joint as usize] * Vector3::y();
-            track.ankles.push(placed.position(ankle));
-            track.soles.push(clip.sole_points(&placed, ankle));
-            ups.push([up(ankle), up(ball), up(ball)]);
-        }
-        for point in 0..3 {
-            let height_m = track.resting_height_m(clip, point);
-            track.soles.iter_mut().zip(&ups).for_each(|(sole, up)| sole[point] -= up[point] * height_m);
-        }
+        let mut track = FootTrack { ankle, ankles: Vec::new(), soles: Vec::new(), down_m: [0.0; 3] };
+        let placed: Vec<Placement> = clip.poses.iter().map(|pose| clip.place(pose)).collect();
+        track.ankles = placed.iter().map(|p| p.position(ankle)).collect();
+        track.soles = placed.iter().map(|p| track.sole(clip, p)).collect();
+        track.down_m = std::array::from_fn(|point| track.resting_height_m(clip, point));
+        track.soles = placed.iter().map(|p| track.sole(clip, p)).collect();
         track
+    }
+
+    /// Heel, ball and toe tip of any pose, as in `soles`.
+    pub fn sole(&self, clip: &Clip, placed: &Placement) -> [Vector3<f64>; 3] {
+        let ball = if self.ankle == Joint::LAnkle { Joint::LMidtarsal } else { Joint::RMidtarsal };
+        let up = [self.ankle, ball, ball].map(|joint| placed.world_from_node[joint as usize] * Vector3::y());
+        let points = clip.sole_points(placed, self.ankle);
+        std::array::from_fn(|i| points[i] - up[i] * self.down_m[i])
     }
 
     /// Median height of a point of the sole while it is slow; 0 where it hardly is.
@@ -84,7 +86,7 @@ impl FootTrack {
         let mut first: [Option<Vector3<f64>>; 3] = [None; 3];
         let mut largest: f64 = 0.0;
         for sole in &self.soles[contact] {
-            let lowest = sole.iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
+            let lowest = lowest_m(sole);
             for (first, p) in first.iter_mut().zip(sole) {
                 *first = (p.y < lowest + TOUCHES_M).then(|| first.unwrap_or(*p));
                 largest = largest.max(first.map_or(0.0, |f| (p - f).xz().norm()));
@@ -100,7 +102,7 @@ impl FootTrack {
             return Vec::new();
         }
         let stands = |frame: usize| {
-            let lowest = self.soles[frame].iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
+            let lowest = lowest_m(&self.soles[frame]);
             let speed = self.slide(frame.min(frames - 2)).xz().norm() * clip.fps;
             lowest < NEAR * clip.hip_height_m && speed < slow_m_s(clip, frame)
         };
@@ -108,10 +110,15 @@ impl FootTrack {
     }
 }
 
+/// Height of the lowest point of a sole; the floor's if it is under that.
+pub fn lowest_m(sole: &[Vector3<f64>; 3]) -> f64 {
+    sole.iter().map(|p| p.y.max(0.0)).fold(f64::INFINITY, f64::min)
+}
+
 /// Weights w_i of the points of a sole.
 fn weights(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
-    let lowest = sole.iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
-    let raw = sole.map(|p| (-(p.y - lowest) / TOUCH_M).exp());
+    let lowest = lowest_m(sole);
+    let raw = sole.map(|p| (-(p.y.max(0.0) - lowest) / TOUCH_M).exp());
     let sum: f64 = raw.iter().sum();
     raw.map(|w| w / sum)
 }

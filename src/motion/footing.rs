@@ -1,36 +1,40 @@
 //! The least squares behind planted feet: small changes of pelvis and legs after which soles that touch do not slide.
 //!
 //! Unknowns x(t) of a frame: shift of the root, its turn about the vertical, and for each leg rotation vectors of hip and ankle
-//! and the bend of the knee, all on the right of the motion's own rotations. With p_i(t) the heel, ball and toe tip, y_i
+//! and the bends of knee and toes, all on the right of the motion's own rotations. With p_i(t) the heel, ball and toe tip, y_i
 //! their heights and u_k the unknowns by their scales,
-//!   min ∫ Σ_k (c_k u_k² + τ_k⁴ ü_k²) + Σ_m (Σ_i a_mi · ṗ_i)²/σ_v² + Σ_i v_i (y_i − y_i,own)²/σ_y² dt                (1)
-//! During a contact a_m are the three ways in which touching points slide as one: along x and z, and turning about their
-//! centre, each a unit vector under the weights w_i = b(h_i/h0), h_i the height over the foot's lowest point and b(r) = (1 − r²)²;
-//! so who touches with the toe alone may pivot on it, and toes that wriggle do not wrench the ankle.
-//! v_i = b(height over the floor/h1): feet come down where they did. c_k is 1, and `FREE` squared for a leg that does not
-//! stand. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
+//!   min ∫ Σ_k (c_k u_k² + τ_k⁴ ü_k²) + Σ_i w_i (ẋ_i² + ż_i²)/σ_v² + Σ_i v_i (y_i − y_i*)²/σ_y² dt                 (1)
+//! During a contact w_i = b(h_i/h0), h_i the height over the foot's lowest point and b(r) = (1 − r²)²: the heel stands first,
+//! then all of the foot, then ball and toe tip while the foot turns about its toes; who touches with the tip alone may pivot
+//! on it. v_i = b(height over the floor/h1): feet come down where they did. y_i* is the own height, in the midst of a contact
+//! the floor's where the point is under or little over it: the toes of recordings flutter there, and a toe that turns drags the
+//! ball along. c_k is 1, and `FREE` squared for a leg that does not stand. Everything is a difference of neighbouring frames, so
+//! the equations are a band of three frames.
 //! Checked against central differences.
 
 use std::ops::Range;
 
 use nalgebra::{DVector, SMatrix, Vector3};
 
-use super::contact::FootTrack;
+use super::contact::{FootTrack, lowest_m};
 use crate::body::{Clip, Joint, Pose, place};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::rotation::{exp, hat, left_jacobian};
 
-/// Hip, knee and ankle of one side.
-pub const LEGS: [[Joint; 3]; 2] = [[Joint::LHip, Joint::LKnee, Joint::LAnkle], [Joint::RHip, Joint::RKnee, Joint::RAnkle]];
+/// Hip, knee, ankle and toes of one side.
+pub const LEGS: [[Joint; 4]; 2] =
+    [[Joint::LHip, Joint::LKnee, Joint::LAnkle, Joint::LMidtarsal], [Joint::RHip, Joint::RKnee, Joint::RAnkle, Joint::RMidtarsal]];
 /// Shift (3) and turn (1) of the root.
 const ROOT: usize = 4;
-/// Hip (3), knee (1) and ankle (3) of a leg.
-const LEG: usize = 7;
+/// Hip (3), knee (1), ankle (3) and toes (1) of a leg.
+const LEG: usize = 8;
 pub const UNKNOWNS: usize = ROOT + 2 * LEG;
 
 /// Scales of the unknowns: changes of a joint and of the pelvis' turn (radians) and place that weigh alike. A pelvis that gives
 /// way more spares the legs and leaves the path.
 const JOINT: f64 = 0.02;
+/// Toes give way first: recordings know least of them. Less turns ankles and knees with them.
+const TOES: f64 = 0.04;
 const TURN: f64 = 0.012;
 const SHIFT_M: f64 = 0.01;
 /// How much more a joint's change weighs while its foot does not stand. Less lets the swing change as much as the stance; more
@@ -46,6 +50,10 @@ const HEIGHT_M: f64 = 0.001;
 /// h0 and h1.
 const TOUCH_M: f64 = 0.01;
 const NEAR_M: f64 = 0.03;
+/// Less leaves toes that flutter over the floor between standing and rising, more lets feet land early.
+const PRESSED_M: f64 = 0.015;
+/// Time from the ends of a contact over which that sets in. Shorter jerks at them.
+const PRESSED_S: f64 = 0.08;
 
 /// Unknowns of one frame.
 pub type Unknowns = [f64; UNKNOWNS];
@@ -53,17 +61,15 @@ pub type Unknowns = [f64; UNKNOWNS];
 /// A point of a sole and its derivatives by the unknowns of the root and of its own leg.
 type Point = (Vector3<f64>, SMatrix<f64, 3, { ROOT + LEG }>);
 
-/// a_m of the three points of a sole.
-type Slide = [Vector3<f64>; 3];
-
 /// One foot over the frames; per frame the three points of its sole.
 struct Foot {
-    /// From a frame to the next within a contact.
-    slides: Vec<Option<[Slide; 3]>>,
+    /// w_i from a frame to the next; zero outside contacts.
+    touching: Vec<[f64; 3]>,
     /// v_i.
     near: Vec<[f64; 3]>,
     heights: Vec<[f64; 3]>,
     stands: Vec<bool>,
+    track: FootTrack,
 }
 
 /// Equation (1) of one clip.
@@ -76,15 +82,22 @@ impl Foot {
     fn new(clip: &Clip, track: &FootTrack, contacts: &[Range<usize>]) -> Foot {
         let frames = clip.poses.len();
         let mut foot = Foot {
-            slides: vec![None; frames],
+            touching: vec![[0.0; 3]; frames],
             near: track.soles.iter().map(|sole| sole.map(|p| bump(p.y.max(0.0) / NEAR_M))).collect(),
-            heights: clip.poses.iter().map(|pose| clip.sole_points(&clip.place(pose), track.ankle).map(|p| p.y)).collect(),
+            heights: track.soles.iter().map(|sole| sole.map(|p| p.y)).collect(),
             stands: vec![false; frames],
+            track: track.clone(),
         };
         for contact in contacts {
             foot.stands[contact.clone()].fill(true);
+            for frame in contact.clone() {
+                let to_end = (frame - contact.start).min(contact.end - 1 - frame) as f64 / clip.fps;
+                let share = 1.0 - bump((to_end / PRESSED_S).min(1.0));
+                foot.heights[frame].iter_mut().for_each(|y| *y += share * (pressed(*y) - *y));
+            }
             for frame in contact.start..contact.end - 1 {
-                foot.slides[frame] = Some(slides(&track.soles[frame], &track.soles[frame + 1]));
+                let [u, v] = [frame, frame + 1].map(|t| touching(&track.soles[t]));
+                foot.touching[frame] = std::array::from_fn(|i| 0.5 * (u[i] + v[i]));
             }
         }
         foot
@@ -95,32 +108,27 @@ fn bump(r: f64) -> f64 {
     (1.0 - r * r).max(0.0).powi(2)
 }
 
-/// a_m of the sole's touching points between two frames.
-fn slides(from: &[Vector3<f64>; 3], to: &[Vector3<f64>; 3]) -> [Slide; 3] {
-    let [u, v] = [from, to].map(touching);
-    let weights: [f64; 3] = std::array::from_fn(|i| 0.5 * (u[i] + v[i]));
-    let sum: f64 = weights.iter().sum();
-    let centre = (0..3).map(|i| from[i] * (weights[i] / sum)).sum::<Vector3<f64>>();
-    let about: [Vector3<f64>; 3] = std::array::from_fn(|i| Vector3::y().cross(&(from[i] - centre)) * weights[i]);
-    let size = (0..3).map(|i| weights[i] * (from[i] - centre).xz().norm_squared()).sum::<f64>().sqrt();
-    let along = |axis: Vector3<f64>| weights.map(|w| axis * (w / sum.sqrt()));
-    [along(Vector3::x()), along(Vector3::z()), about.map(|a| if size > 1e-6 { a / size } else { Vector3::zeros() })]
+/// The height that a point is to have: on the floor where it is under or little over it.
+fn pressed(height_m: f64) -> f64 {
+    let over = height_m.max(0.0);
+    over * (1.0 - bump(over / PRESSED_M))
 }
 
 /// w_i of a sole; 1 for its lowest point.
 fn touching(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
-    let lowest = sole.iter().map(|p| p.y).fold(f64::INFINITY, f64::min);
-    sole.map(|p| bump((p.y - lowest) / TOUCH_M))
+    let lowest = lowest_m(sole);
+    sole.map(|p| bump((p.y.max(0.0) - lowest) / TOUCH_M))
 }
 
 fn vector(x: &[f64]) -> Vector3<f64> {
     Vector3::new(x[0], x[1], x[2])
 }
 
-/// Hip, knee and ankle vectors of a leg's unknowns.
-fn leg_vectors(x: &Unknowns, side: usize) -> [Vector3<f64>; 3] {
+/// Rotation vectors of a leg's unknowns, joint by joint.
+fn leg_vectors(x: &Unknowns, side: usize) -> [Vector3<f64>; 4] {
     let leg = &x[ROOT + side * LEG..][..LEG];
-    [vector(leg), Vector3::new(leg[3], 0.0, 0.0), vector(&leg[4..])]
+    let bend = |k: usize| Vector3::new(leg[k], 0.0, 0.0);
+    [vector(leg), bend(3), vector(&leg[4..]), bend(7)]
 }
 
 impl<'a> Footing<'a> {
@@ -148,18 +156,24 @@ impl<'a> Footing<'a> {
         std::array::from_fn(|side| {
             let turns = leg_vectors(x, side);
             // About the joint in the world, by a joint's rotation vector.
-            let by: [_; 3] = std::array::from_fn(|k| {
+            let by: [_; 4] = std::array::from_fn(|k| {
                 let world_from_joint = placed.world_from_node[LEGS[side][k] as usize].to_rotation_matrix();
                 (placed.position(LEGS[side][k]), world_from_joint * left_jacobian(&-turns[k]))
             });
-            self.clip.sole_points(&placed, LEGS[side][2]).map(|p| {
-                let [hip, knee, ankle] = by.map(|(at, turn)| -hat(&(p - at)) * turn);
+            let points = self.feet[side].track.sole(self.clip, &placed);
+            std::array::from_fn(|i| {
+                let p = points[i];
+                let [hip, knee, ankle, toes] = by.map(|(at, turn)| -hat(&(p - at)) * turn);
                 let mut j = SMatrix::<f64, 3, { ROOT + LEG }>::zeros();
                 j.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
                 j.set_column(3, &Vector3::y().cross(&(p - pose.root)));
                 j.fixed_view_mut::<3, 3>(0, ROOT).copy_from(&hip);
                 j.set_column(ROOT + 3, &knee.column(0));
                 j.fixed_view_mut::<3, 3>(0, ROOT + 4).copy_from(&ankle);
+                // The heel is behind the toes' joint.
+                if i > 0 {
+                    j.set_column(ROOT + 7, &toes.column(0));
+                }
                 (p, j)
             })
         })
@@ -172,22 +186,20 @@ impl<'a> Footing<'a> {
         let soles: Vec<_> = state.iter().enumerate().map(|(t, x)| self.soles(t, x)).collect();
         for (t, side) in (0..state.len()).flat_map(|t| [(t, 0), (t, 1)]) {
             let foot = &self.feet[side];
-            // Σ a · p at an instant, and its derivatives.
-            let sum = |t: usize, a: &Slide| (0..3).map(|i| a[i].dot(&soles[t][side][i].0)).sum::<f64>();
-            let by = |t: usize, a: &Slide, factor: f64| {
-                let row = (0..3).map(|i| a[i].transpose() * soles[t][side][i].1 * factor).sum::<SMatrix<f64, 1, { ROOT + LEG }>>();
+            // Derivatives of a coordinate of a point of the sole.
+            let by = |t: usize, i: usize, axis: usize, factor: f64| {
+                let row = soles[t][side][i].1.row(axis) * factor;
                 (0..ROOT + LEG).map(move |k| (t * UNKNOWNS + if k < ROOT { k } else { k + side * LEG }, row[k]))
             };
             for i in (0..3).filter(|i| foot.near[t][*i] > 0.0) {
                 let factor = (dt_s * foot.near[t][i]).sqrt() / HEIGHT_M;
-                let up: Slide = std::array::from_fn(|k| if k == i { Vector3::y() } else { Vector3::zeros() });
-                let terms: [_; ROOT + LEG] = gather(by(t, &up, factor));
-                take(factor * (sum(t, &up) - foot.heights[t][i]), &terms);
+                let terms: [_; ROOT + LEG] = gather(by(t, i, 1, factor));
+                take(factor * (soles[t][side][i].0.y - foot.heights[t][i]), &terms);
             }
-            for a in foot.slides[t].iter().flatten() {
-                let factor = 1.0 / (dt_s.sqrt() * SLIDE_M_S);
-                let terms: [_; 2 * (ROOT + LEG)] = gather(by(t, a, -factor).chain(by(t + 1, a, factor)));
-                take(factor * (sum(t + 1, a) - sum(t, a)), &terms);
+            for (i, axis) in (0..3).flat_map(|i| [(i, 0), (i, 2)]).filter(|(i, _)| foot.touching[t][*i] > 0.0) {
+                let factor = (foot.touching[t][i] / dt_s).sqrt() / SLIDE_M_S;
+                let terms: [_; 2 * (ROOT + LEG)] = gather(by(t, i, axis, -factor).chain(by(t + 1, i, axis, factor)));
+                take(factor * (soles[t + 1][side][i].0[axis] - soles[t][side][i].0[axis]), &terms);
             }
         }
     }
@@ -199,6 +211,7 @@ impl<'a> Footing<'a> {
             let (scale, tau_s) = match k {
                 0..3 => (SHIFT_M, ROOT_S),
                 3 => (TURN, ROOT_S),
+                _ if (k - ROOT) % LEG == LEG - 1 => (TOES, LEG_S),
                 _ => (JOINT, LEG_S),
             };
             let free = k >= ROOT && !self.feet[(k - ROOT) / LEG].stands[t];
@@ -262,7 +275,7 @@ mod tests {
         let tracks = LEGS.map(|leg| FootTrack::new(&clip, leg[2]));
         let contacts = tracks.each_ref().map(|foot| foot.contacts(&clip));
         let footing = Footing::new(&clip, &tracks, &contacts);
-        assert!(footing.feet.iter().all(|f| f.slides.iter().any(Option::is_some) && f.stands.iter().any(|s| !s)));
+        assert!(footing.feet.iter().all(|f| f.touching.iter().any(|w| w[0] > 0.0) && f.stands.iter().any(|s| !s)));
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let state: Vec<Unknowns> = clip.poses.iter().map(|_| std::array::from_fn(|_| 0.2 * (rng.random::<f64>() - 0.5))).collect();
         let residuals = |state: &[Unknowns]| {
@@ -289,7 +302,7 @@ mod tests {
         let normal = (&footing).linearise(&state);
         assert!((normal.cost / (&footing).cost(&state) - 1.0).abs() < 1e-12);
         let all = residuals(&state);
-        for (row, column) in [(0, 0), (40, 21), (3 * UNKNOWNS + 3, 2 * UNKNOWNS + 8), (4 * UNKNOWNS + 5, 2 * UNKNOWNS + 5)] {
+        for (row, column) in [(0, 0), (40, 21), (3 * UNKNOWNS + 3, 2 * UNKNOWNS + 8), (4 * UNKNOWNS + 11, 2 * UNKNOWNS + 11)] {
             let entry = |terms: &[(usize, f64)], k: usize| terms.iter().find(|t| t.0 == k).map_or(0.0, |t| t.1);
             let expected: f64 = jacobian.iter().map(|t| entry(t, row) * entry(t, column)).sum();
             let gradient: f64 = jacobian.iter().zip(&all).map(|(t, r)| entry(t, row) * r).sum();

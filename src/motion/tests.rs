@@ -348,18 +348,19 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
     let run = follow(&gaits, &Profile::steady(3.0, -0.25, 6.0).unwrap(), &offsets(), 60.0).0;
     // The pelvis may leave the path by as many millimetres.
     for (name, clip, most_mm) in
-        [("start, walk, run, stop", straight, 30.0), ("bend of 4 m", bend, 30.0), ("run in a bend of 4 m", run, 80.0)]
+        [("start, walk, run, stop", straight, 30.0), ("bend of 4 m", bend, 30.0), ("run in a bend of 4 m", run, 90.0)]
     {
         let planted = plant_feet(&clip);
         let [before, after] = [&clip, &planted.clip].map(|c| largest_drift(c, &planted.contacts));
         let [calm, shaken] = [&clip, &planted.clip].map(largest_accelerations);
-        let (mut elsewhere, mut standing, mut others) = (0.0f64, 0.0f64, 0.0f64);
+        let (mut elsewhere, mut toes, mut standing, mut others) = (0.0f64, 0.0f64, 0.0f64, 0.0f64);
         for (frame, (a, b)) in clip.poses.iter().zip(&planted.clip.poses).enumerate() {
             let stands = stand(&planted.contacts, frame);
             for joint in Joint::ALL.into_iter().skip(1) {
                 let change = a.joint(joint).angle_to(b.joint(joint)).to_degrees();
                 match super::footing::LEGS.iter().position(|leg| leg.contains(&joint)) {
                     Some(side) if stands[side] => standing = standing.max(change),
+                    Some(side) if joint == super::footing::LEGS[side][3] => toes = toes.max(change),
                     Some(_) => elsewhere = elsewhere.max(change),
                     None => others = others.max(change),
                 }
@@ -369,7 +370,7 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
         let shift_mm = 1e3 * moved(|a, b| (a.root - b.root).norm());
         let turn = moved(|a, b| a.world_from_root.angle_to(&b.world_from_root)).to_degrees();
         println!(
-            "{name}: drift {:.1} -> {:.2} mm, change {standing:.1} deg standing, {elsewhere:.1} deg elsewhere, pelvis by {shift_mm:.0} mm \
+            "{name}: drift {:.1} -> {:.2} mm, change {standing:.1} deg standing, {elsewhere:.1} deg elsewhere, toes there {toes:.1} deg, pelvis by {shift_mm:.0} mm \
              and {turn:.1} deg, largest acceleration {:.0} -> {:.0} rad/s2, of the root {:.1} -> {:.1} m/s2, {} contacts",
             1e3 * before,
             1e3 * after,
@@ -380,9 +381,9 @@ fn planted_feet_stay_where_they_stand_and_nothing_pops() {
             planted.contacts.iter().map(Vec::len).sum::<usize>(),
         );
         assert!(after < 0.003 && after < 0.1 * before, "{before} {after}");
-        assert!(elsewhere < 3.0 && standing < 6.0 && others < 1e-6, "{elsewhere} {standing} {others}");
+        assert!(elsewhere < 3.0 && toes < 6.0 && standing < 10.0 && others < 1e-6, "{elsewhere} {toes} {standing} {others}");
         assert!(shift_mm < most_mm && turn < 5.0, "{shift_mm} {turn}");
-        assert!((0..2).all(|k| shaken[k] < 1.05 * calm[k]), "{calm:?} {shaken:?}");
+        assert!((0..2).all(|k| shaken[k] < 1.1 * calm[k]), "{calm:?} {shaken:?}");
         assert_eq!(planted.sliding(), 0);
     }
 }
