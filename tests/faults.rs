@@ -7,7 +7,7 @@ mod study;
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, SystemTime};
@@ -214,6 +214,58 @@ fn a_frame_that_vanishes_in_mid_run_fails_its_session_only() {
     fs::copy(FILM.join("cam_01/000008.png"), session.join("cam_01/000008.png")).unwrap();
     let again = batch(&study, &results, &[]);
     assert!(again.status.success() && said(&again).matches(": done in").count() == 1, "{}", said(&again));
+}
+
+/// `model build` lists its files before it reads them, one after another with one thread: while the first, a pipe, keeps it waiting,
+/// the second vanishes.
+fn build_while_one_vanishes(mocap: &Path, output: &Path, first: &[u8]) -> Output {
+    let pipe = mocap.join("p1/a.bvh");
+    fs::create_dir_all(mocap.join("p1")).unwrap();
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let arguments = ["--threads", "1", "model", "build", text(mocap), "--activity", "walking", "-o", text(output)];
+    let run = muybridge(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // Opens when it reads.
+    let mut writer = fs::File::options().write(true).open(&pipe).unwrap();
+    fs::remove_file(mocap.join("p2/walk.bvh")).unwrap();
+    writer.write_all(first).unwrap();
+    drop(writer);
+    run.wait_with_output().unwrap()
+}
+
+#[test]
+fn a_recording_that_vanishes_in_mid_run_is_left_out() {
+    let place = tempfile::tempdir().unwrap();
+    let (mocap, others) = (place.path().join("mocap"), place.path().join("others"));
+    for seed in [2, 3, 4, 5] {
+        let cycle = synthetic::subject(Activity::Walking, seed).cycle(1.2, 0);
+        let clip = play_cycle(&cycle, &Shape::template(1.7).offsets(), 60.0, Length::Cycles(3));
+        for folder in [&mocap, &others].into_iter().take(if seed == 2 { 1 } else { 2 }) {
+            bvh::write_clip(&folder.join(format!("p{seed}/walk.bvh")), &clip, None).unwrap();
+        }
+    }
+    let models = place.path().join("models");
+    let vanished = mocap.join("p2/walk.bvh");
+    let output = build_while_one_vanishes(&mocap, &models.join("m.npz"), b"no motion");
+    let told = said(&output);
+    assert!(output.status.success(), "{told}");
+    let line = format!("left out: {}: cannot be read: ", vanished.display());
+    assert_eq!(told.lines().filter(|l| l.starts_with("left out: ") && l.contains("walk.bvh")).count(), 1, "{told}");
+    assert!(told.contains(&line) && told.contains("No such file"), "{told}");
+    succeed(&["model", "build", text(&others), "--activity", "walking", "-o", text(&place.path().join("others.npz"))]);
+    assert!(fs::read(models.join("m.npz")).unwrap() == fs::read(place.path().join("others.npz")).unwrap());
+    assert_eq!(files_below(&models).len(), 1);
+}
+
+#[test]
+fn where_all_recordings_vanish_there_is_no_model() {
+    let place = tempfile::tempdir().unwrap();
+    let (mocap, output) = (place.path().join("mocap"), place.path().join("models/m.npz"));
+    let clip =
+        play_cycle(&synthetic::subject(Activity::Walking, 2).cycle(1.2, 0), &Shape::template(1.7).offsets(), 60.0, Length::Cycles(3));
+    bvh::write_clip(&mocap.join("p2/walk.bvh"), &clip, None).unwrap();
+    let error = error_of(&build_while_one_vanishes(&mocap, &output, b""));
+    assert!(error.contains("none of 2 motions can be used for walking; ") && error.contains("a.bvh"), "{error}");
+    assert!(!output.parent().unwrap().exists());
 }
 
 /// Times of files and in status files are told and never asked.

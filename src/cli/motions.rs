@@ -88,7 +88,9 @@ fn cycles_of(entry: &Entry, activity: Activity) -> Result<(Vec<Cycle>, Vec<Strin
     }
     let path = entry.path.display().to_string();
     // Readers name the file themselves; it is named once.
-    let read = read_clip(&entry.path).map_err(|e| e.to_string().trim_start_matches(&format!("{path}: ")).to_string())?;
+    let unnamed =
+        |error: String| error.trim_start_matches(&format!("{path}: ")).replace(&format!("cannot read {path}: "), "cannot be read: ");
+    let read = read_clip(&entry.path).map_err(|e| unnamed(e.to_string()))?;
     let label = Label {
         subject: entry.subject.clone(),
         source: file_name(&entry.path),

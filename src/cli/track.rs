@@ -57,6 +57,10 @@ pub struct TrackArgs {
     /// Leave out report.html, thumbnail.jpg, gait.csv and angles_cycle.csv
     #[arg(long)]
     no_report: bool,
+    /// Also write a recording for the viewer of rerun.io: cameras, pictures, clouds, body, skeleton and curves
+    #[cfg(feature = "rerun")]
+    #[arg(long, value_name = "FILE")]
+    rrd: Option<PathBuf>,
 }
 
 /// A model with what the outputs say of it.
@@ -150,8 +154,23 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     if config.pictures == Some(true) {
         draw(&args.output.join("pictures"), &session.rig, &models[tracked.fit.model], &tracked)?;
     }
+    #[cfg(feature = "rerun")]
+    if let Some(path) = &args.rrd {
+        record(path, &session, &tracked)?;
+    }
     summary(&args.output, &models, &tracked.fit);
     Ok(())
+}
+
+/// A track as a recording for rerun's viewer.
+#[cfg(feature = "rerun")]
+fn record(path: &Path, session: &Session, tracked: &Tracked) -> Result<()> {
+    let mut recording =
+        report::recording::Recording::of_track(&file_name(&session.folder), &session.rig, &tracked.fit, &tracked.observations)?;
+    for frame in session.frames() {
+        recording.pictures(&session.rig, &frame?)?;
+    }
+    muybridge::io::write_atomic(path, &recording.bytes()?).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// What the cameras saw in all frames.

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Matrix4, Quaternion, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 
+use super::glb_kinds::check_kinds;
 use super::glb_tracks::motions;
 use super::write_atomic;
 use crate::animal::creature::{Bone, Creature, Local, Motion, Skin, Vertex};
@@ -46,7 +47,7 @@ pub fn read(path: &Path) -> Result<Creature, GlbError> {
     let file = gltf::Gltf::from_slice(&bytes).map_err(|e| GlbError::Format { path: path.into(), why: e.to_string() })?;
     let content = |what: &str| GlbError::Content { path: path.into(), what: what.into() };
     let blob = file.blob.as_deref().unwrap_or_default();
-    check_extents(&file.document, blob).map_err(|what| content(&what))?;
+    check_extents(&file.document, blob).and_then(|()| check_kinds(&file.document)).map_err(|what| content(&what))?;
     let (bones, bone_of_node) = bones(&file.document).ok_or_else(|| content("the nodes form a loop"))?;
     if bones.is_empty() || bones.len() > usize::from(u16::MAX) {
         return Err(content("it holds no node, or too many"));
@@ -91,11 +92,11 @@ fn check_extents(document: &gltf::Document, blob: &[u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// Whether so many items lie within a buffer view.
+/// Whether so many items lie within a buffer view, none over another.
 fn reaches(count: usize, view: &gltf::buffer::View, offset: usize, size: usize) -> bool {
     let stride = view.stride().unwrap_or(size);
     let reach = count.saturating_sub(1).checked_mul(stride).and_then(|r| r.checked_add(size)?.checked_add(offset));
-    reach.is_some_and(|r| r <= view.length())
+    stride >= size && reach.is_some_and(|r| r <= view.length())
 }
 
 /// Nodes may share meshes and skins, and channels key times: values, joints and keys that the file unfolds to, before any is read.

@@ -17,6 +17,7 @@ pub mod fit_json;
 pub mod frame_cloud;
 pub mod gait_csv;
 pub mod glb;
+mod glb_kinds;
 mod glb_tracks;
 pub mod images;
 pub mod joints_csv;

@@ -27,6 +27,8 @@ pub mod model;
 pub mod overlay;
 pub mod page;
 pub mod person;
+#[cfg(feature = "rerun")]
+pub mod recording;
 pub mod rig;
 pub mod strips;
 pub mod study;

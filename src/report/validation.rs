@@ -7,16 +7,32 @@ use super::page::{Grade, Section, Verdict, facts, gallery, page, table};
 use crate::motion_model::Model;
 use crate::style::validate::{Score, Validation};
 
-/// What every method and metric is, for readers of the page.
+/// What every method is, for readers of the page.
 const METHODS: [(&str, &str); 8] = [
-    ("default", "the style carried to the other speed or length as `generate` does it"),
+    ("default", "the style carried to the other speed or length, as generate does it"),
     ("paper", "the style paper's equation (8)"),
     ("several", "the default from all the person's other speeds or lengths at once"),
     ("mean", "the population's mean at the target"),
-    ("unchanged", "the person's own motion, unchanged"),
+    ("unchanged", "the person's own motion unchanged"),
     ("mean-change", "the own motion plus the population's mean change"),
     ("intra", "cycles of one subject at one speed among themselves"),
     ("inter", "cycles of different subjects"),
+];
+
+/// What the errors are measured by, in the order of the page.
+struct Metric {
+    name: &'static str,
+    title: &'static str,
+    column: &'static str,
+    unit: &'static str,
+    decimals: usize,
+}
+
+const METRICS: [Metric; 4] = [
+    Metric { name: "rms_deg", title: "Joint angles, r.m.s.", column: "angles, deg", unit: "degrees", decimals: 2 },
+    Metric { name: "rms_mm", title: "Joints' places, r.m.s.", column: "joints, mm", unit: "mm", decimals: 1 },
+    Metric { name: "eq6", title: "Weights, equation (6)", column: "eq. (6)", unit: "distance", decimals: 2 },
+    Metric { name: "mahalanobis", title: "Weights, Mahalanobis", column: "Mahalanobis", unit: "distance", decimals: 2 },
 ];
 
 /// A validated model.
@@ -30,24 +46,26 @@ pub struct ValidationReport<'a> {
     pub validation: &'a Validation,
 }
 
-/// Names in the order in which they come first.
-fn names(scores: &[Score], of: fn(&Score) -> &str) -> Vec<&str> {
+/// Methods in the order in which they come first.
+fn methods(scores: &[Score]) -> Vec<&'static str> {
     scores.iter().fold(Vec::new(), |mut known, s| {
-        if !known.contains(&of(s)) {
-            known.push(of(s));
+        if !known.contains(&s.method) {
+            known.push(s.method);
         }
         known
     })
 }
 
+fn meaning(method: &str) -> &'static str {
+    METHODS.iter().find(|m| m.0 == method).map_or("", |m| m.1)
+}
+
 impl ValidationReport<'_> {
     /// The whole page.
     pub fn html(&self) -> String {
-        let scores = &self.validation.scores;
-        let metrics = names(scores, |s| &s.metric);
-        let charts: Vec<Markup> = metrics.iter().map(|metric| self.chart(metric)).collect();
+        let charts: Vec<Markup> = METRICS.iter().map(|metric| self.chart(metric)).collect();
         let sections = [
-            Section::new("Errors", html! { (self.means(&metrics)) (gallery(&charts)) (methods(scores)) }),
+            Section::new("Errors", html! { (self.means()) (gallery(&charts)) }),
             Section::new("By subject", self.subjects()),
             Section::new("What was done", self.facts()),
         ];
@@ -65,13 +83,13 @@ impl ValidationReport<'_> {
         let baselines = ["mean", "unchanged", "mean-change"].map(|b| (b, error(b)));
         let ours = error(method);
         let better: Vec<&str> = baselines.iter().filter(|b| b.1 <= ours).map(|b| b.0).collect();
-        let words: Vec<String> = baselines.iter().map(|(name, value)| format!("{name} {value:.2}")).collect();
+        let words: Vec<String> = baselines.iter().map(|(name, value)| format!("{value:.2} for {}", meaning(name))).collect();
         let sentence = format!(
-            "A left-out subject's motion at another speed or length is off by {ours:.2} degrees (r.m.s. over joints) with `{method}`; baselines: {}.",
+            "The motion of somebody who is not in the database is off by {ours:.2} degrees (r.m.s. over the joints) at another speed or length; {}.",
             words.join(", ")
         );
         let mut notes: Vec<String> =
-            better.iter().map(|b| format!("The baseline `{b}` is as good or better: this model's styles do not carry over.")).collect();
+            better.iter().map(|b| format!("As good or better is {}: this model's styles do not carry over.", meaning(b))).collect();
         if self.model.synthetic {
             notes.push("The model is synthetic: these figures say nothing about people.".into());
         }
@@ -85,42 +103,41 @@ impl ValidationReport<'_> {
         Verdict { grade, sentence, notes }
     }
 
-    fn means(&self, metrics: &[&str]) -> Markup {
-        let cell = |method: &str, metric: &str| self.value(method, metric, "all").map_or("\u{2013}".into(), |v| format!("{v:.3}"));
-        let rows: Vec<Vec<String>> = names(&self.validation.scores, |s| s.method)
+    fn means(&self) -> Markup {
+        let cell = |method: &str, metric: &Metric| self.cell(method, metric, "all");
+        let rows: Vec<Vec<String>> = methods(&self.validation.scores)
             .into_iter()
-            .map(|method| std::iter::once(method.to_string()).chain(metrics.iter().map(|metric| cell(method, metric))).collect())
+            .map(|method| {
+                [method, meaning(method)].map(String::from).into_iter().chain(METRICS.iter().map(|metric| cell(method, metric))).collect()
+            })
             .collect();
-        let head: Vec<&str> = std::iter::once("method").chain(metrics.iter().copied()).collect();
+        let head: Vec<&str> = ["method", ""].into_iter().chain(METRICS.iter().map(|metric| metric.column)).collect();
         html! {
-            (table(&head, &rows, 1))
+            (table(&head, &rows, 2))
             p.small.soft {
-                "Means over the left-out subjects, angles pooled; eq6 is the paper's distance of weights, mahalanobis the true one, rms_deg the angle and rms_mm the place of joints against the recording."
+                "Means over the left-out subjects against their recordings, angles pooled; eq. (6) is the paper's distance of weights, Mahalanobis the one that their covariance gives."
             }
         }
     }
 
+    fn cell(&self, method: &str, metric: &Metric, left_out: &str) -> String {
+        self.value(method, metric.name, left_out).map_or("\u{2013}".into(), |v| format!("{v:.*}", metric.decimals))
+    }
+
     /// One dot per subject and method, the mean larger.
-    fn chart(&self, metric: &str) -> Markup {
-        let methods = names(&self.validation.scores, |s| s.method);
+    fn chart(&self, metric: &Metric) -> Markup {
+        let methods = methods(&self.validation.scores);
         let places = |all: bool| -> Vec<[f64; 2]> {
             let own = |(k, method): (usize, &&str)| {
-                let scores = self.validation.scores.iter().filter(|s| s.method == *method && s.metric == metric);
+                let scores = self.validation.scores.iter().filter(|s| s.method == *method && s.metric == metric.name);
                 scores.filter(|s| (s.left_out == "all") == all).map(|s| [k as f64, s.value]).collect::<Vec<_>>()
             };
             methods.iter().enumerate().flat_map(own).collect()
         };
         let top = places(false).iter().chain(&places(true)).map(|p| p[1]).fold(0.0, f64::max);
         Chart {
-            title: metric.into(),
-            y_label: if metric == "rms_deg" {
-                "degrees"
-            } else if metric == "rms_mm" {
-                "mm"
-            } else {
-                "distance"
-            }
-            .into(),
+            title: metric.title.into(),
+            y_label: metric.unit.into(),
             x_range: Some([-0.5, methods.len() as f64 - 0.5]),
             y_range: Some([0.0, 1.06 * top.max(1e-9)]),
             dots: vec![
@@ -134,19 +151,21 @@ impl ValidationReport<'_> {
     }
 
     fn subjects(&self) -> Markup {
-        let methods = names(&self.validation.scores, |s| s.method);
-        let cell = |method: &str, subject: &str| self.value(method, "rms_deg", subject).map_or("\u{2013}".into(), |v| format!("{v:.2}"));
+        let methods = methods(&self.validation.scores);
         let rows: Vec<Vec<String>> = self
             .model
             .subjects()
             .into_iter()
             .map(|subject| {
                 let cycles = self.model.members.iter().filter(|m| m.subject == subject).count();
-                [subject.to_string(), cycles.to_string()].into_iter().chain(methods.iter().map(|m| cell(m, subject))).collect()
+                [subject.to_string(), cycles.to_string()]
+                    .into_iter()
+                    .chain(methods.iter().map(|m| self.cell(m, &METRICS[0], subject)))
+                    .collect()
             })
             .collect();
         let head: Vec<&str> = ["left out", "cycles"].into_iter().chain(methods.iter().copied()).collect();
-        html! { p.soft { "rms_deg, degrees" } (table(&head, &rows, 1)) }
+        html! { p.soft { "Joint angles, r.m.s., degrees" } (table(&head, &rows, 1)) }
     }
 
     fn facts(&self) -> Markup {
@@ -159,17 +178,13 @@ impl ValidationReport<'_> {
                 ("model's hash", self.hash.to_string()),
                 ("database", format!("{}, {} cycles of {} subjects, {low:.2} to {high:.2} {unit}", model.activity, model.members.len(), model.subjects().len())),
                 ("variance kept", format!("{}", self.variance)),
-                ("cases", format!("{}, in {} of them too few other subjects were recorded at both ends", v.cases, v.sparse_cases)),
+                ("cases", match v.sparse_cases {
+                    0 => v.cases.to_string(),
+                    few => format!("{}, in {few} of them too few other subjects were recorded at both ends", v.cases),
+                }),
                 ("version", concat!("muybridge ", env!("CARGO_PKG_VERSION")).to_string()),
             ]))
             p.small.soft { "Numbers beside this page: validation.csv, of every angle degrees.csv, of every pair of parameters pairs.csv." }
         }
     }
-}
-
-fn methods(scores: &[Score]) -> Markup {
-    let present = names(scores, |s| s.method);
-    let rows: Vec<(&str, String)> =
-        METHODS.iter().filter(|m| present.contains(&m.0)).map(|(name, what)| (*name, what.to_string())).collect();
-    facts(&rows)
 }

@@ -87,7 +87,7 @@ fn scene(view: &View) -> Value {
         "up": [up.x, up.y, up.z],
         "eye": eye(&view.towards_viewer, &up),
         "bones": bones,
-        "body": ellipsoids(view.shape),
+        "body": ellipsoids(view.shape).iter().map(numbers).collect::<Vec<_>>(),
         "instants": instants,
     })
 }
@@ -116,8 +116,15 @@ fn instant(instant: &Instant) -> Value {
     })
 }
 
-/// Node, centre and semi-axes of every primitive, millimetres, so wide that they reach the skin.
-fn ellipsoids(shape: &Shape) -> Vec<Vec<f64>> {
+/// A primitive of the body as a solid that reaches the skin, metres, in the frame of its node.
+pub struct Ellipsoid {
+    pub node: Joint,
+    pub centre: Vector3<f64>,
+    pub half_axes: Vector3<f64>,
+}
+
+/// One for every primitive.
+pub fn ellipsoids(shape: &Shape) -> Vec<Ellipsoid> {
     let surface = Surface::new(shape);
     let offsets = shape.offsets();
     let posed = PosedSurface::new(&surface, &place(&offsets, &Pose::rest(offsets[0])));
@@ -135,13 +142,17 @@ fn ellipsoids(shape: &Shape) -> Vec<Vec<f64>> {
         }
         radius
     };
-    (0..surface.primitives.len())
-        .map(|k| {
-            let p = &surface.primitives[k];
-            let metres = [p.centre.x, p.centre.y, p.centre.z, reach(k, 0), reach(k, 1), reach(k, 2)];
-            std::iter::once(p.node as usize as f64).chain(metres.map(|v| (1e4 * v).round() / 10.0)).collect()
-        })
-        .collect()
+    let ellipsoid = |k: usize| {
+        let p = &surface.primitives[k];
+        Ellipsoid { node: p.node, centre: p.centre, half_axes: Vector3::from_fn(|axis, _| reach(k, axis)) }
+    };
+    (0..surface.primitives.len()).map(ellipsoid).collect()
+}
+
+/// Node, centre and half axes, millimetres.
+fn numbers(e: &Ellipsoid) -> Vec<f64> {
+    let metres = e.centre.iter().chain(&e.half_axes);
+    std::iter::once(e.node as usize as f64).chain(metres.map(|v| (1e4 * v).round() / 10.0)).collect()
 }
 
 #[cfg(test)]
@@ -165,7 +176,7 @@ mod tests {
         let all = ellipsoids(&shape);
         for (e, p) in all.iter().zip(&posed.primitives) {
             for axis in (0..3).filter(|a| *a != p.axis) {
-                let tip = p.centre + Vector3::ith(axis, e[4 + axis] / 1000.0);
+                let tip = p.centre + Vector3::ith(axis, e.half_axes[axis]);
                 near += usize::from(posed.distance(&tip).abs() < 0.03);
             }
         }

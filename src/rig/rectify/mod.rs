@@ -16,7 +16,7 @@
 
 mod warp;
 
-use super::{Camera, Rig};
+use super::{Camera, Lens, Rig};
 use image::{GrayImage, ImageBuffer, Luma};
 use nalgebra::{Matrix2, Matrix3, Point2, Rotation3, Vector2, Vector3};
 use rayon::prelude::*;
@@ -48,6 +48,16 @@ pub enum RectifyError {
     OffPlane(String, f64),
     #[error("the baselines of cameras {0} run along their viewing direction; stereo needs cameras side by side")]
     AlongAxis(String),
+}
+
+/// The picture that a camera of the same matrix takes without distortion; black where this one does not look.
+pub fn without_lens(camera: &Camera, image: &GrayImage) -> GrayImage {
+    let ideal = Camera { lens: Lens::IDEAL, ..camera.clone() };
+    GrayImage::from_fn(image.width(), image.height(), |x, y| {
+        let normalised = ideal.normalise(&Point2::new(x.into(), y.into()));
+        let at = normalised.map(|n| camera.distorted_pixel(&n));
+        Luma([at.map_or(0.0, |p| bilinear(image, p.x as f32, p.y as f32)).round() as u8])
+    })
 }
 
 /// One camera of a rectified group.
