@@ -56,7 +56,7 @@ pub fn runner_up(candidates: &[Candidate]) -> Option<usize> {
 
 /// The best start of the model that explains the frames best, on these frames, and how all did.
 pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known: &Known) -> (State, Vec<Candidate>) {
-    let search = Settings { model_m: SEARCH_M, ..SETTINGS };
+    let search = Settings { model_m: SEARCH_M, at_skin: false, ..SETTINGS };
     let begin = |model: &&Model| -> Vec<(f64, State)> {
         let mean = Curve::new(model, 0);
         let found = start::hypotheses(track, frames, &mean, model, &search, known);
@@ -96,7 +96,7 @@ fn pair(found: &[Hypothesis]) -> Vec<&Hypothesis> {
 
 /// Settings where skins may be `model_m` apart.
 fn rough(model_m: f64) -> Settings {
-    Settings { model_m, phase_acceleration: STEADY_PHASE, ..SETTINGS }
+    Settings { model_m, phase_acceleration: STEADY_PHASE, at_skin: false, ..SETTINGS }
 }
 
 /// The first rough stages: the mean motion, placed and turned.

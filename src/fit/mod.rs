@@ -2,8 +2,8 @@
 //!
 //! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]), for every model and both half-cycle
 //! hypotheses until the evidence of few frames tells them apart ([`contest`]) → root, phases, weights, shape by
-//! Levenberg–Marquardt over all frames ([`problem`]), then with more components, at last with turns of single joints against
-//! the model → poses, weights, shape and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
+//! Levenberg–Marquardt over all frames ([`problem`]), then with more components, with turns of single joints against the model,
+//! at last with derivatives at the skin ([`weighing`]) → poses, weights, shape and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
 //! Components keep what they add to joints all cycle long: without it in the last stage the legs of mesh figures came out 0.4
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
@@ -120,6 +120,7 @@ pub struct Fit {
 /// The last stages of a fit. Accelerations are those of a steady walk: larger values let noise through, smaller ones cut corners.
 pub const SETTINGS: Settings = Settings {
     residual: PointResidual::Distance,
+    at_skin: true,
     model_m: 0.02,
     point_weight: 0.16,
     ray_weight: 0.16,
@@ -269,27 +270,28 @@ pub fn resume(
     let dense = chosen(&all, options.points, options.rays);
     step(0.4)?;
     let shaped = if options.lengths { SHAPED } else { STYLED };
-    let last = Stage { free: shaped, settings, refreshes: 10 };
-    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, settings: Settings { model_m: 0.03, ..settings }, refreshes: 5 });
+    let approach = Settings { at_skin: false, ..settings };
+    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, settings: Settings { model_m: 0.03, ..approach }, refreshes: 5 });
     step(0.55)?;
     let curve = Curve::new(model, options.variance.map_or(options.components, |part| model.components(part)));
     state.weights.resize(curve.components(), 0.0);
-    state = run.stage(state, &dense, &curve, &last);
+    state = run.stage(state, &dense, &curve, &Stage { free: shaped, settings: approach, refreshes: 10 });
     step(0.7)?;
-    let mut free = shaped;
-    let posed = Free { lengths: options.lengths, ..POSED };
+    let mut last = Stage { free: shaped, settings, refreshes: 10 };
     if options.deviations {
+        let posed = Stage { free: Free { lengths: options.lengths, ..POSED }, ..last };
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
-        let own = run.stage(own, &dense, &curve, &Stage { free: posed, ..last });
+        let own = run.stage(own, &dense, &curve, &Stage { settings: approach, ..posed });
         step(0.85)?;
         let left_out: Vec<Frame> = people.par_iter().map(|p| targets::left_out(p, rig, known.floor_m, options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &settings, &known, state)).cost;
         if cost(&own) < cost(&state) {
-            (state, free) = (own, posed);
+            (state, last) = (own, posed);
         }
     }
+    state = run.stage(state, &dense, &curve, &last);
     step(0.95)?;
-    Ok(finish(run, candidates, state, free, curve, &dense))
+    Ok(finish(run, candidates, state, last.free, curve, &dense))
 }
 
 fn finish(run: Run, candidates: Vec<Candidate>, state: State, free: Free, curve: Curve, frames: &[Frame]) -> Fit {

@@ -58,6 +58,8 @@ pub struct Frame {
 #[derive(Clone, Copy, Debug)]
 pub struct Settings {
     pub residual: PointResidual,
+    /// Derivatives are taken at the skin, not at the targets: right in noise, but slow from afar.
+    pub at_skin: bool,
     /// Difference between the person's skin and the model's, m; large at the start so that far points pull.
     pub model_m: f64,
     /// Share of a cloud point that is new information: neighbours share their correlation window.
@@ -507,6 +509,7 @@ pub(super) mod tests {
 
     pub const SETTINGS: Settings = Settings {
         residual: PointResidual::Distance,
+        at_skin: true,
         model_m: 0.03,
         point_weight: 0.1,
         ray_weight: 0.1,
