@@ -202,6 +202,7 @@ fn exact_points_give_exact_weights_when_nothing_else_pulls() {
     let none = 1e9;
     let settings = Settings {
         residual: PointResidual::Distance,
+        at_skin: true,
         model_m: 0.05,
         point_weight: 1e14,
         ray_weight: 1.0,
