@@ -3,7 +3,7 @@
 //! The fit weighs its residuals with less than their precision, so that limbs unlike the model's do not bend it, and its errors
 //! are not those of its normal equations A = Jᵀ W J + P. With V the variances that the residuals have, and the truth spread about
 //! the priors as P says, the gradient at the truth has covariance B, and the solution
-//!   Σ = A⁻¹ B A⁻¹ + ½ m² Σ_n g_n g_nᵀ,  B = Jᵀ W V W J + P;   A⁻¹ B A⁻¹ = −d/dh (A + h B)⁻¹ at h = 0.                (1)
+//!   Σ = A⁻¹ B A⁻¹ + l² Σ_n g_n g_nᵀ,  B = Jᵀ W V W J + P;   A⁻¹ B A⁻¹ = −d/dh (A + h B)⁻¹ at h = 0.                (1)
 //! Of the inverses only the blocks of one frame and of the shared unknowns are formed (selected inversion), so time and
 //! memory are linear in the number of frames; the derivative is taken numerically, to six digits.
 //! Neighbouring points share correlation windows and the same misfit of the body's skin, so N residuals are not N
@@ -12,8 +12,9 @@
 //!   s = Σ ω_i / Σ_c (Σ_{i∈c} ω_i z_i)²,  V_i = (nᵀ Σ_i n + m²) / s,                                             (2)
 //! one for points and one for rays: what makes the scores' variance the one that they show (a cluster-robust "sandwich"). m is
 //! the misfit of the skin, what the residuals show beyond the points' own covariance.
-//! The second term of (1): half of that variance, say, stays with the skin of a node n in all frames and is averaged out by no number
-//! of them; g_n is how far a metre there moves the solution (consider covariance; G. Bierman, Factorization methods, 1977).
+//! The second term of (1): a misfit l that stays with the skin of node n in all frames is averaged out by no number of them; g_n is
+//! how far it moves the solution (consider covariance; G. Bierman, Factorization methods, 1977). l is what nodes' mean residuals
+//! show, twice: the fit has taken away as much as it has left, say.
 //! A joint at x moves by J δ, hence its covariance is J Σ Jᵀ.
 //! What is not in it: joint centres of another convention, and motions that differ from all subjects of the database.
 //! Checked against the dense inverse, and by the coverage of its intervals over repeated noise.
@@ -55,8 +56,6 @@ pub struct Uncertainty {
 const FEWEST: f64 = 100.0;
 /// Least misfit of any body model, metres: by what widths are off on bodies of its own kind (`bench coverage`).
 const LEAST_MISFIT_M: f64 = 0.0005;
-/// Part of the misfit's variance that stays in all frames.
-const LASTING: f64 = 0.5;
 /// Of no kind of residual less is new.
 const LEAST_SHARE: f64 = 1e-3;
 /// Step of the derivative in equation (1).
@@ -68,7 +67,7 @@ pub fn uncertainty(curve: &Curve, frames: &[Frame], settings: &Settings, free: F
     let misfit_m = misfit_m(&problem);
     let of_kind = |points| problem.frozen().iter().map(move |f| f.iter().filter(move |f| f.is_point == points));
     let shares = [true, false].map(|points| share(of_kind(points), misfit_m));
-    let pulls = problem.skin_pulls(state) * (misfit_m * LASTING.sqrt());
+    let pulls = problem.skin_pulls(state) * lasting_m(&problem);
     let normal = problem.linearise(state);
     let shown = |f: &Frozen| f.weight.powi(2) * (f.variance + misfit_m.powi(2)) / shares[usize::from(!f.is_point)];
     let scores = problem.reweighted(shown).linearise(state);
@@ -82,6 +81,18 @@ fn misfit_m(problem: &Problem) -> f64 {
     let median = |values: Vec<f64>| quantile(values, 0.5).unwrap_or(0.0);
     let spread = 1.4826 * median(points().map(|f| f.distance_m.abs()).collect());
     (spread * spread - median(points().map(|f| f.variance).collect())).max(0.0).sqrt().max(LEAST_MISFIT_M)
+}
+
+/// Root mean square of the nodes' mean distances, for what is left and what was taken.
+fn lasting_m(problem: &Problem) -> f64 {
+    let mut nodes = [[0.0; 2]; NODES];
+    for f in problem.frozen().iter().flatten().filter(|f| f.is_point) {
+        nodes[f.node as usize][0] += f.robust * f.distance_m;
+        nodes[f.node as usize][1] += f.robust;
+    }
+    let seen = || nodes.iter().filter(|n| n[1] > 0.0);
+    let square: f64 = seen().map(|n| n[0] * n[0] / n[1]).sum();
+    (2.0 * square / seen().map(|n| n[1]).sum::<f64>().max(1.0)).sqrt().max(LEAST_MISFIT_M)
 }
 
 /// Equation (2) over frames of residuals.
