@@ -175,7 +175,7 @@ fn a_stopped_track_goes_on_with_the_frames_it_has() {
     let kept: Vec<PathBuf> = files_below(&work);
     let of = |name: &str| kept.iter().find(|p| p.ends_with(name)).unwrap_or_else(|| panic!("no {name} in {kept:?}"));
     let stages = kept.iter().filter(|p| p.extension().is_some_and(|e| e == "fit")).count();
-    assert!(kept.len() - stages == FRAMES && stages > 5, "{kept:?}");
+    assert!(kept.len() - stages == FRAMES && stages > 3, "{kept:?}");
 
     // Some are missing, one is cut off: those alone are made again.
     let untouched = fs::metadata(of("000005.frame")).unwrap().modified().unwrap();
@@ -183,7 +183,7 @@ fn a_stopped_track_goes_on_with_the_frames_it_has() {
     fs::write(of("000002.frame"), &fs::read(of("000002.frame")).unwrap()[..1000]).unwrap();
     let last = kept.iter().filter(|p| p.extension().is_some_and(|e| e == "fit")).max().unwrap();
     fs::remove_file(last).unwrap();
-    fs::write(of("03.fit"), "no stage").unwrap();
+    fs::write(of("02.fit"), "no stage").unwrap();
     assert!(track("second", &options) == plain);
     assert!(fs::metadata(of("000002.frame")).unwrap().len() > 1000 && of("000000.frame").exists() && last.exists());
     assert_eq!(fs::metadata(of("000005.frame")).unwrap().modified().unwrap(), untouched);
