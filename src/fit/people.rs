@@ -123,9 +123,8 @@ fn pieces(points: &[CloudPoint], which: impl Iterator<Item = u32>, up: &Vector3<
 mod tests {
     use super::*;
     use crate::clouds::Cloud;
-    use crate::io::calib_toml;
-    use nalgebra::Matrix3;
-    use std::path::Path;
+    use crate::rig::{Lens, Up};
+    use nalgebra::{Matrix3, Rotation3};
     use std::sync::Arc;
 
     fn column(at: [f64; 2], count: usize) -> Vec<CloudPoint> {
@@ -142,8 +141,18 @@ mod tests {
         Observation { cloud: Cloud { points }, ..Observation::default() }
     }
 
+    /// Two cameras at a height of a metre that look along y.
     fn rig() -> Rig {
-        calib_toml::read_rig(&Path::new(env!("CARGO_MANIFEST_DIR")).join("calib/phantom_lab.toml")).unwrap()
+        let camera_from_world = Rotation3::from_matrix_unchecked(Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0));
+        let camera = |x: f64| Camera {
+            name: format!("at {x}"),
+            size_px: [640, 480],
+            matrix: Matrix3::new(550.0, 0.0, 320.0, 0.0, 550.0, 240.0, 0.0, 0.0, 1.0),
+            lens: Lens::BrownConrady([0.0; 8]),
+            camera_from_world,
+            translation: -(camera_from_world * Vector3::new(x, 0.0, 1.0)),
+        };
+        Rig { cameras: [0.0, 0.3].map(camera).to_vec(), up: Up::Z }
     }
 
     #[test]
