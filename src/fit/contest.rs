@@ -1,8 +1,8 @@
 //! The rough start: which motion model the footage shows, which half of the cycle, and where.
 //!
 //! On frames [`APART_S`] apart every model gets its best start and the one half a cycle away: the mean motion placed and turned,
-//! then ten weights; the one with the largest evidence is chosen. With θ the unknowns there, P the precision that data and priors give the weights α, other
-//! unknowns eliminated, and Λ their variances in the database,
+//! then ten weights; the one with the largest evidence is chosen. With θ the unknowns there, P the precision that data and
+//! priors give the weights α, other unknowns eliminated, and Λ their variances in the database,
 //!   −ln p(data | model) ≈ E_data(θ) + E_prior(θ) + ½ ln det(Λ P),                                                  (1)
 //! Laplace's approximation but for what all models have in common; E_data is the robust cost. So a model pays for people unlike
 //! its own and for weights that the data need to know well, whatever their number. A model whose mean motion is far behind another's

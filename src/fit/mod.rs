@@ -264,6 +264,8 @@ pub fn resume(
     let model = models[contest::best(&candidates)];
     let mut state = rough.between(&few, &times);
     let ten = Curve::new(model, 10);
+    // A start that was judged by its mean motion has none.
+    state.weights.resize(ten.components(), 0.0);
 
     let mut run = Run { known, residual: options.residual, iterations: 0, checkpoints, stages: 0 };
     let settings = Settings { residual: options.residual, ..SETTINGS };
