@@ -7,7 +7,7 @@ use common::mocap;
 use muybridge::body::{Clip, Joint, Shape};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::read_clip;
-use muybridge::math::rotation::log;
+use muybridge::math::{order, rotation::log};
 use muybridge::motion::contact::FootTrack;
 use muybridge::motion::footing::LEGS;
 use muybridge::motion::{Length, Planted, plant_feet, play, synthesize};
@@ -79,9 +79,8 @@ struct Found {
     shaken: f64,
 }
 
-fn quantile(mut values: Vec<f64>, part: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[((values.len() - 1) as f64 * part).round() as usize]
+fn quantile(values: Vec<f64>, part: f64) -> f64 {
+    order::quantile(values, part).unwrap()
 }
 
 /// Every subject at three speeds, as `generate` makes them.

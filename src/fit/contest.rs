@@ -11,6 +11,8 @@
 //! Fails when: the person does two things in one sequence.
 //! Checked against phantoms that walk, run and jump, and recorded walks and a run.
 
+use std::fmt;
+
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
@@ -42,6 +44,12 @@ pub struct Candidate {
     pub costs: [f64; 2],
 }
 
+impl fmt::Display for Candidate {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{:.0} ({:.0})", self.costs[0], self.costs[1])
+    }
+}
+
 /// Place of the candidate that costs least; the first of none.
 pub fn best(candidates: &[Candidate]) -> usize {
     (0..candidates.len()).min_by(|a, b| candidates[*a].costs[0].total_cmp(&candidates[*b].costs[0])).unwrap_or(0)
@@ -56,7 +64,7 @@ pub fn runner_up(candidates: &[Candidate]) -> Option<usize> {
 
 /// The best start of the model that explains the frames best, on these frames, and how all did.
 pub(super) fn contest(models: &[&Model], track: &Track, frames: &[Frame], known: &Known) -> (State, Vec<Candidate>) {
-    let search = Settings { model_m: SEARCH_M, at_skin: false, ..SETTINGS };
+    let search = rough(SEARCH_M);
     let begin = |model: &&Model| -> Vec<(f64, State)> {
         let mean = Curve::new(model, 0);
         let found = start::hypotheses(track, frames, &mean, model, &search, known);

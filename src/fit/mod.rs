@@ -3,7 +3,8 @@
 //! Observations ([`targets`]) → track, heading, cadence and phase by search ([`start`]), for every model and both half-cycle
 //! hypotheses until the evidence of few frames tells them apart ([`contest`]) → root, phases, weights, shape by
 //! Levenberg–Marquardt over all frames ([`problem`]), then with more components, with turns of single joints against the model,
-//! at last with derivatives at the skin ([`weighing`]) → poses, weights, shape and their [`uncertainty`]; what beside the weights is the person's own ([`own_motion`]).
+//! at last with derivatives at the skin ([`weighing`]) → poses, weights, shape and their [`uncertainty`]; what beside the
+//! weights is the person's own ([`own_motion`]).
 //! Components keep what they add to joints all cycle long: without it in the last stage the legs of mesh figures came out 0.4
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
@@ -180,7 +181,6 @@ impl Checkpoints<'_> {
 /// Everything one run needs beside the state.
 struct Run<'a> {
     known: Known,
-    residual: PointResidual,
     iterations: u64,
     checkpoints: &'a Checkpoints<'a>,
     /// Stages begun.
@@ -190,7 +190,7 @@ struct Run<'a> {
 impl Run<'_> {
     /// Stages of which no checkpoints are kept.
     fn rough(known: &Known) -> Run<'static> {
-        Run { known: *known, residual: PointResidual::Distance, iterations: 0, checkpoints: &Checkpoints::NONE, stages: 0 }
+        Run { known: *known, iterations: 0, checkpoints: &Checkpoints::NONE, stages: 0 }
     }
 
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
@@ -267,7 +267,7 @@ pub fn resume(
     // A start that was judged by its mean motion has none.
     state.weights.resize(ten.components(), 0.0);
 
-    let mut run = Run { known, residual: options.residual, iterations: 0, checkpoints, stages: 0 };
+    let mut run = Run { known, iterations: 0, checkpoints, stages: 0 };
     let settings = Settings { residual: options.residual, ..SETTINGS };
     let dense = chosen(&all, options.points, options.rays);
     step(0.4)?;
@@ -293,14 +293,13 @@ pub fn resume(
     }
     state = run.stage(state, &dense, &curve, &last);
     step(0.95)?;
-    Ok(finish(run, candidates, state, last.free, curve, &dense))
+    Ok(finish(run, candidates, state, &last, curve, &dense))
 }
 
-fn finish(run: Run, candidates: Vec<Candidate>, state: State, free: Free, curve: Curve, frames: &[Frame]) -> Fit {
-    let settings = Settings { residual: run.residual, ..SETTINGS };
-    let uncertainty = uncertainty::uncertainty(&curve, frames, &settings, free, &run.known, &state);
+fn finish(run: Run, candidates: Vec<Candidate>, state: State, last: &Stage, curve: Curve, frames: &[Frame]) -> Fit {
+    let uncertainty = uncertainty::uncertainty(&curve, frames, &last.settings, last.free, &run.known, &state);
     let seconds = frames.last().map_or(0.0, |f| f.time_s) - frames.first().map_or(0.0, |f| f.time_s);
-    let frames = fitness(&curve, frames, &settings, &run.known, &state);
+    let frames = fitness(&curve, frames, &last.settings, &run.known, &state);
     let poses = (0..state.carriers.len()).map(|t| state.pose(&curve, t)).collect();
     let (first, last) = (&state.carriers[0], &state.carriers[state.carriers.len() - 1]);
     let travelled: f64 =

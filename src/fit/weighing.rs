@@ -4,9 +4,9 @@
 //! A cloud point counts with its distance to the skin, the point x of a ray nearest to the body likewise. With y the point of the
 //! skin nearest to x and n the normal there, r = nᵀ(x − y) + κ (√d_eff(y) − √d_0), y frozen: taken at x itself, the derivative for
 //! a limb's width would be larger for points outside than for those inside, and limbs found 2 to 5 % too wide in noise; but from
-//! afar fewer steps lead there with x in place of y. As
-//! [`PointResidual::Ray`] a cloud point counts with how far, t, it lies along its line of sight d behind where that meets the front
-//! of the body: r = t nᵀd + κ (√d_eff(y) − √d_0), y the front.
+//! afar fewer steps lead there with x in place of y.
+//! As [`PointResidual::Ray`] a cloud point counts with how far, t, it lies along its line of sight d behind where that meets the
+//! front of the body: r = t nᵀd + κ (√d_eff(y) − √d_0), y the front.
 //! Checked against a dense search (rays, lines of sight); the weights enter the Jacobian tests of `problem`.
 
 use nalgebra::Vector3;

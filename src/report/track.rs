@@ -226,9 +226,9 @@ impl TrackReport<'_> {
 
     /// Every model with its costs, best first.
     fn candidates(&self) -> String {
-        let mut all: Vec<_> = self.given.iter().zip(&self.fit.candidates).map(|(name, c)| (c.costs, name)).collect();
-        all.sort_by(|a, b| a.0[0].total_cmp(&b.0[0]));
-        let each: Vec<String> = all.iter().map(|([best, other], name)| format!("{name} {best:.0} ({other:.0})")).collect();
+        let mut all: Vec<_> = self.given.iter().zip(&self.fit.candidates).collect();
+        all.sort_by(|a, b| a.1.costs[0].total_cmp(&b.1.costs[0]));
+        let each: Vec<String> = all.iter().map(|(name, costs)| format!("{name} {costs}")).collect();
         each.join(", ")
     }
 

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 
 use anyhow::Result;
 use clap::{Args, ValueEnum};
-use muybridge::fit::FitOptions;
+use muybridge::fit::{Candidate, FitOptions};
 use muybridge::math::order::quantile;
 use muybridge::motion_model::{Activity, Model};
 use muybridge::phantom::SightOptions;
@@ -158,7 +158,7 @@ fn starts(count: u64, models: &[&Model]) -> Result<()> {
                     errors.push(found.joints_mm);
                     angles.push(found.legs_deg);
                 } else {
-                    let costs: Vec<String> = found.candidates.iter().map(|c| format!("{:.0} ({:.0})", c.costs[0], c.costs[1])).collect();
+                    let costs: Vec<String> = found.candidates.iter().map(Candidate::to_string).collect();
                     let what =
                         format!("{:.0} mm, {:.1} deg, right {}, costs {}", found.joints_mm, found.legs_deg, found.right, costs.join(", "));
                     missed(seed, &walk, &what);
