@@ -92,11 +92,11 @@ fn write_page(study: &Study, statuses: &[Status]) -> Result<()> {
     write_atomic(&path, report::study::html(&page).as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Writes summary.csv and index.html of all sessions, prints counts and failures; an error where a chosen session failed or is not done.
+/// Writes index.html and, when all else is in place, summary.csv of all sessions; prints counts and failures; an error where a chosen session failed or is not done.
 pub fn summarise(study: &Study, all: &[StudySession], chosen: &[StudySession]) -> Result<()> {
     let mut statuses: Vec<Status> = all.iter().map(|s| study.status(s)).collect();
-    status_json::write_summary(&study.results, &statuses)?;
     write_page(study, &statuses)?;
+    status_json::write_summary(&study.results, &statuses)?;
     statuses.retain(|status| chosen.iter().any(|s| s.name == status.session));
     println!("{}, in {}", counts(&statuses), study.results.display());
     let failed: Vec<&Status> = statuses.iter().filter(|s| s.state == State::Failed).collect();
