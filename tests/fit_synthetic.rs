@@ -7,7 +7,7 @@ use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
 use muybridge::fit::state::{Carrier, State, Turns};
-use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, PointResidual, contest, fit, resume};
+use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, PointResidual, Silhouette, contest, fit, resume};
 use muybridge::math::arrow::{LmOptions, minimise};
 use muybridge::motion::{Length, play_cycle};
 use muybridge::motion_model::{Activity, Model, synthetic};
@@ -68,7 +68,7 @@ fn poses(state: &State, curve: &Curve) -> Vec<Pose> {
     (0..state.carriers.len()).map(|t| state.pose(curve, t)).collect()
 }
 
-/// What the rig sees of a body: points and masks of frames with number, time and pose.
+/// What the rig sees of a body: points and silhouettes of frames with number, time and pose.
 fn observed(rig: &Rig, shape: &Shape, frames: &[(usize, f64, &Pose)]) -> Vec<Observation> {
     let (surface, offsets) = (Surface::new(shape), shape.offsets());
     let group = &groups(rig).unwrap()[0];
@@ -77,8 +77,8 @@ fn observed(rig: &Rig, shape: &Shape, frames: &[(usize, f64, &Pose)]) -> Vec<Obs
         let figure = Figure::new(&surface, &offsets, &place(&offsets, pose));
         let points = sighting::points(&figure, group, number, &sight).into_iter();
         let point = |(position, covariance)| CloudPoint { position, colour: [0; 3], confidence: 1.0, covariance };
-        let masks = Arc::new(sighting::masks(&figure, rig, number, &sight).into_iter().map(Some).collect());
-        Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, masks }
+        let silhouettes = sighting::masks(&figure, rig, number, &sight).iter().map(|mask| Some(Silhouette::new(mask))).collect();
+        Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, silhouettes: Arc::new(silhouettes) }
     };
     frames.par_iter().map(observe).collect()
 }
@@ -108,7 +108,7 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
     // Ten frames in which nothing was seen, and points that are no numbers.
     let mut gaps = observations.clone();
     for o in &mut gaps[9..19] {
-        (o.cloud, o.masks) = (Cloud::default(), Arc::new(vec![None; rig.cameras.len()]));
+        (o.cloud, o.silhouettes) = (Cloud::default(), Arc::new(vec![None; rig.cameras.len()]));
     }
     let nowhere = CloudPoint { position: Vector3::repeat(f64::NAN), ..gaps[3].cloud.points[0].clone() };
     gaps[3].cloud.points.push(nowhere);

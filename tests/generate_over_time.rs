@@ -4,9 +4,8 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::{mocap, path, run};
+use common::{cycles, mocap, path, run};
 use muybridge::body::{Joint, Pose};
-use muybridge::io::manifest::find_motions;
 use muybridge::io::model_npz::{model_hash, read_model};
 use muybridge::io::{bvh, read_clip, style_json};
 use muybridge::motion::{Length, play_cycle, synthesize};
@@ -172,9 +171,9 @@ fn what_cannot_be_followed_is_one_sentence() {
     }
 }
 
-fn cut(file: &Path, activity: Activity) -> Vec<Cycle> {
+fn walks(file: &Path) -> Vec<Cycle> {
     let subject = file.parent().unwrap().file_name().unwrap().to_string_lossy().into_owned();
-    let label = Label { subject, source: "x".into(), activity, parameter: None, start_s: None, end_s: None };
+    let label = Label { subject, source: "x".into(), activity: Activity::Walking, parameter: None, start_s: None, end_s: None };
     segment(&read_clip(file).unwrap().clip, &label).map(|s| s.cycles).unwrap_or_default()
 }
 
@@ -202,13 +201,12 @@ fn kept(model: &Model, styles: &[Style], method: Method) -> Vec<(f64, f64)> {
 
 #[test]
 fn stylised_walks_keep_their_style_at_another_speed() {
-    let (Some(walks), Some(stylised)) = (mocap("cmu-asfamc"), mocap("bandai-namco-1/data")) else { return };
-    let cycles = find_motions(&[walks], None).unwrap().iter().flat_map(|e| cut(&e.path, Activity::Walking)).collect();
+    let (Some(cycles), Some(stylised)) = (cycles("cmu-asfamc", Activity::Walking), mocap("bandai-namco-1/data")) else { return };
     let model = Model::build(Activity::Walking, false, &database::thin(cycles).0).unwrap();
     let mut files: Vec<PathBuf> = std::fs::read_dir(stylised).unwrap().map(|e| e.unwrap().path()).collect();
     files.retain(|f| f.to_string_lossy().contains("_walk_") && f.to_string_lossy().ends_with("_001.bvh"));
     files.sort();
-    let styles: Vec<Style> = files.iter().filter_map(|f| Style::of_cycles(&model, "", &cut(f, Activity::Walking))).collect();
+    let styles: Vec<Style> = files.iter().filter_map(|f| Style::of_cycles(&model, "", &walks(f))).collect();
     assert_eq!(styles.len(), 15);
     let (ours, paper) = (kept(&model, &styles, Method::Default), kept(&model, &styles, Method::Paper(Metric::Paper)));
     for (name, found) in [("default", &ours), ("paper", &paper)] {

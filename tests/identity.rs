@@ -1,10 +1,8 @@
 //! Who a recorded walk belongs to: every CMU trial against a database that has the others, equation (6) beside the evidence.
 
-use std::path::Path;
+mod common;
 
-use muybridge::io::manifest::find_motions;
-use muybridge::io::read_clip;
-use muybridge::motion_model::{Activity, Cycle, Label, Model, database, segment};
+use muybridge::motion_model::{Activity, Cycle, Model, database};
 use muybridge::style::curves::mean_vector;
 use muybridge::style::{Population, Style, curves::knots, identity};
 use nalgebra::DVector;
@@ -12,35 +10,14 @@ use rayon::prelude::*;
 
 const COMPONENTS: usize = 20;
 
-fn walks(data: &Path) -> Vec<Cycle> {
-    let entries = find_motions(&[data.to_path_buf()], None).unwrap();
-    let of = |e: &muybridge::io::manifest::Entry| -> Vec<Cycle> {
-        let source = e.path.file_stem().unwrap().to_string_lossy().into_owned();
-        let label = Label {
-            subject: e.subject.clone(),
-            source,
-            activity: Activity::Walking,
-            parameter: e.parameter,
-            start_s: e.start_s,
-            end_s: e.end_s,
-        };
-        read_clip(&e.path).ok().and_then(|read| segment(&read.clip, &label).ok()).map_or(Vec::new(), |s| s.cycles)
-    };
-    entries.par_iter().flat_map(of).collect()
-}
-
 fn trial(cycle: &Cycle) -> &str {
     cycle.source.split(' ').next().unwrap()
 }
 
 #[test]
 fn recorded_walkers_are_found_by_evidence() {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data/mocap/cmu-asfamc");
-    if !data.is_dir() {
-        println!("skipped: no ../shared/data/mocap/cmu-asfamc");
-        return;
-    }
-    let cycles = database::thin(walks(&data)).0;
+    let Some(cycles) = common::cycles("cmu-asfamc", Activity::Walking) else { return };
+    let cycles = database::thin(cycles).0;
     let mut trials: Vec<&str> = cycles.iter().map(trial).collect();
     trials.sort();
     trials.dedup();

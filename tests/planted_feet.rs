@@ -3,27 +3,15 @@
 
 mod common;
 
-use common::mocap;
+use common::cycles;
 use muybridge::body::{Clip, Joint, Shape};
-use muybridge::io::manifest::find_motions;
-use muybridge::io::read_clip;
 use muybridge::math::{order, rotation::log};
 use muybridge::motion::contact::FootTrack;
 use muybridge::motion::footing::LEGS;
 use muybridge::motion::{Length, Planted, plant_feet, play, synthesize};
-use muybridge::motion_model::{Activity, Cycle, Label, Model, database, segment};
+use muybridge::motion_model::{Activity, Cycle, Model, database};
 use muybridge::style::{Method, Population, Style};
 use nalgebra::Vector3;
-
-fn cycles(folder: &str, activity: Activity) -> Option<Vec<Cycle>> {
-    let cut = |entry: muybridge::io::manifest::Entry| {
-        let source = entry.path.to_string_lossy().into_owned();
-        let label =
-            Label { subject: entry.subject, source, activity, parameter: entry.parameter, start_s: entry.start_s, end_s: entry.end_s };
-        segment(&read_clip(&entry.path).ok()?.clip, &label).map(|s| s.cycles).ok()
-    };
-    Some(find_motions(&[mocap(folder)?], None).unwrap().into_iter().filter_map(cut).flatten().collect())
-}
 
 /// How far a point of the sole goes from where it touched (on the floor or within 2 mm of the lowest), per contact, mm.
 fn drifts_mm(clip: &Clip, planted: &Planted) -> Vec<f64> {
@@ -143,6 +131,6 @@ fn recorded_people_stand_still_too() {
         );
         assert!(sliding(before) * 10 > 9 * before.len() && sliding(after) * 40 < after.len());
         assert!(quantile(after.clone(), 1.0) < 10.0);
-        assert!(legs.0 < 3.0 && legs.1 < 6.0 && found.shaken < 1.1);
+        assert!(legs.1 < 3.0 && found.shaken < 1.1);
     }
 }

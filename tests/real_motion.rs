@@ -2,27 +2,14 @@
 
 mod common;
 
-use common::mocap;
+use common::{cut, cycles, mocap};
 use muybridge::body::{Clip, Pose};
-use muybridge::io::manifest::{Entry, find_motions};
+use muybridge::io::manifest::find_motions;
 use muybridge::io::read_clip;
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, CadenceLaw, Cycle, Label, Model, SAMPLES, database, segment, synthetic};
 use muybridge::style::validate::validate;
 use nalgebra::Vector3;
-
-fn cut(entry: &Entry, activity: Activity) -> Vec<Cycle> {
-    let clip = read_clip(&entry.path).unwrap().clip;
-    let label = Label {
-        subject: entry.subject.clone(),
-        source: entry.path.file_stem().unwrap().to_string_lossy().into_owned(),
-        activity,
-        parameter: entry.parameter,
-        start_s: entry.start_s,
-        end_s: entry.end_s,
-    };
-    segment(&clip, &label).map(|s| s.cycles).unwrap_or_default()
-}
 
 /// Trial, median speed in m/s and number of left strides, as another program measured them.
 fn table(source: &str) -> Vec<(String, f64, usize)> {
@@ -58,8 +45,7 @@ fn speeds_and_strides_of_recorded_walks() {
 
 #[test]
 fn cadence_of_recorded_walks_follows_inmans_law() {
-    let Some(folder) = mocap("cmu-asfamc") else { return };
-    let cycles: Vec<Cycle> = find_motions(&[folder], None).unwrap().iter().flat_map(|e| cut(e, Activity::Walking)).collect();
+    let Some(cycles) = cycles("cmu-asfamc", Activity::Walking) else { return };
     let (cycles, _) = database::thin(cycles);
     let model = Model::build(Activity::Walking, false, &cycles).unwrap();
     let (fitted, inman) = (model.cadence(), CadenceLaw::prior(Activity::Walking));
@@ -93,8 +79,7 @@ fn treadmill_runs_have_the_belts_speed_and_every_stride() {
 /// The ordering that the paper found (style paper, figure 8) on people it was not made with.
 #[test]
 fn interpolation_lies_between_intra_and_inter_variability_for_recorded_runners() {
-    let Some(folder) = mocap("hamner-running") else { return };
-    let cycles: Vec<Cycle> = find_motions(&[folder], None).unwrap().iter().flat_map(|e| cut(e, Activity::Running)).collect();
+    let Some(cycles) = cycles("hamner-running", Activity::Running) else { return };
     let model = Model::build(Activity::Running, false, &cycles).unwrap();
     let scores = validate(&model, 0.95).unwrap().scores;
     let all = |method: &str| scores.iter().find(|s| s.method == method && s.metric == "eq6" && s.left_out == "all").unwrap().value;

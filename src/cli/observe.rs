@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use muybridge::clouds::{CloudError, CloudOptions, CloudRig, FrameCloud};
-use muybridge::fit::Observation;
+use muybridge::fit::{Observation, Silhouette};
 use muybridge::footage::FrameSet;
 use muybridge::io::frame_cloud;
 use muybridge::io::session::Session;
@@ -52,8 +52,9 @@ pub fn observe(
                 cloud => cloud?,
             };
             each(frame, &cloud)?;
-            let (number, time_s, masks) = (frame.number, frame.time_s, Arc::new(cloud.masks));
-            observations.push(Observation { number, time_s, cloud: cloud.cloud, masks });
+            let (number, time_s) = (frame.number, frame.time_s);
+            let silhouettes = cloud.masks.iter().map(|mask| mask.as_ref().map(Silhouette::new)).collect();
+            observations.push(Observation { number, time_s, cloud: cloud.cloud, silhouettes: Arc::new(silhouettes) });
         }
         batch = next?;
     }

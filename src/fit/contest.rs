@@ -17,7 +17,7 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 
 use super::curve::Curve;
-use super::problem::{Frame, Known, Problem, Settings};
+use super::problem::{Frame, Free, Known, Problem, Settings};
 use super::start::{self, Hypothesis, Track};
 use super::state::State;
 use super::weighing::total;
@@ -110,14 +110,18 @@ fn rough(model_m: f64) -> Settings {
 /// The first rough stages: the mean motion, placed and turned.
 fn placed(known: &Known, state: State, frames: &[Frame], mean: &Curve) -> State {
     let mut run = Run::rough(known);
-    let state = run.stage(state, frames, mean, &Stage { free: PLACED, settings: rough(0.08), refreshes: 4 });
-    run.stage(state, frames, mean, &Stage { free: TURNED, settings: rough(0.06), refreshes: 6 })
+    let state = run.stage(state, frames, mean, &stage(PLACED, 0.08, 4));
+    run.stage(state, frames, mean, &stage(TURNED, 0.06, 6))
 }
 
 /// The last rough stage: the weights of `ten`, stature and widths.
 fn styled(known: &Known, state: State, frames: &[Frame], ten: &Curve) -> State {
     let state = State { weights: vec![0.0; ten.components()], ..state };
-    Run::rough(known).stage(state, frames, ten, &Stage { free: STYLED, settings: rough(ROUGH_M), refreshes: 8 })
+    Run::rough(known).stage(state, frames, ten, &stage(STYLED, ROUGH_M, 8))
+}
+
+fn stage(free: Free, model_m: f64, refreshes: usize) -> Stage {
+    Stage { free, settings: rough(model_m), refreshes, least_change: 1e-3 }
 }
 
 /// Frames at least [`APART_S`] apart, the first and the last among them; all where that leaves fewer than [`FEWEST_FRAMES`].

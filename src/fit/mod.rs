@@ -14,6 +14,7 @@ pub mod curve;
 pub mod own_motion;
 pub mod people;
 pub mod problem;
+pub mod silhouette;
 pub mod start;
 pub mod state;
 pub mod targets;
@@ -21,8 +22,6 @@ pub mod uncertainty;
 pub mod weighing;
 pub mod whole_cycle;
 mod wrench;
-
-use std::sync::Arc;
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -33,8 +32,10 @@ use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
 pub use contest::Candidate;
 use curve::Curve;
-use problem::{Frame, Free, Known, Outside, Problem, Settings};
+use problem::{Frame, Free, Known, Problem, Settings};
+pub use silhouette::Silhouette;
 use state::{State, Turns};
+use targets::Choice;
 pub use targets::Observation;
 pub use uncertainty::Uncertainty;
 pub use weighing::PointResidual;
@@ -147,7 +148,14 @@ struct Stage {
     free: Free,
     settings: Settings,
     refreshes: usize,
+    /// Ends where a round changes the cost by less than this part of it.
+    least_change: f64,
 }
+
+/// For stages that only lead to the next one: after more rounds of theirs the last one ends at the same place.
+const ROUGHLY: f64 = 1e-2;
+/// Larger ends up to half a degree early.
+const CLOSELY: f64 = 3e-4;
 
 const PLACED: Free = Free { rotation: false, phase: false, weights: false, stature: false, lengths: false, widths: false, posture: false };
 const TURNED: Free = Free { rotation: true, phase: true, ..PLACED };
@@ -199,8 +207,8 @@ impl Run<'_> {
         let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, cost: f64::INFINITY, state });
         while at.rounds < stage.refreshes {
             let problem = Problem::new(curve, frames, &stage.settings, stage.free, &self.known, &at.state);
-            let cost = total(&problem.fitness).cost;
-            if (at.cost - cost).abs() < 1e-3 * cost {
+            let cost = total(&problem.fitness).cost + problem.prior_cost(&at.state);
+            if (at.cost - cost).abs() < stage.least_change * cost {
                 break;
             }
             let (state, summary) = minimise(problem, at.state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
@@ -250,15 +258,11 @@ pub fn resume(
         return Err(FitError::Crowd { crowded, frames: people.len() });
     }
     let track = start::track(&people, &viewpoint, &up, floor_m)?;
-    let outsides: Vec<Arc<Vec<Outside>>> = people.par_iter().map(|p| Arc::new(targets::outsides(p, rig))).collect();
     let known = Known { viewpoint, up, stature_m: track.stature_m, floor_m: floor_m.filter(|floor| *floor == track.floor_m) };
-    let chosen = |which: &[usize], points, rays| -> Vec<Frame> {
-        which.par_iter().map(|t| targets::frame(&people[*t], rig, &outsides[*t], known.floor_m, points, rays)).collect()
-    };
-    let all: Vec<usize> = (0..people.len()).collect();
+    let choices: Vec<Choice> = people.par_iter().map(|p| Choice::new(p, rig, known.floor_m)).collect();
     let times: Vec<f64> = people.iter().map(|p| p.time_s()).collect();
     let few = contest::apart(&times);
-    let sparse = chosen(&few, 200, 40);
+    let sparse: Vec<Frame> = few.iter().map(|t| choices[*t].frame(rig, 200, 40)).collect();
     step(0.0)?;
     let (rough, candidates) = contest::contest(models, &track.at(&few), &sparse, &known);
     let model = models[contest::best(&candidates)];
@@ -269,23 +273,27 @@ pub fn resume(
 
     let mut run = Run { known, iterations: 0, checkpoints, stages: 0 };
     let settings = Settings { residual: options.residual, ..SETTINGS };
-    let dense = chosen(&all, options.points, options.rays);
+    let dense: Vec<Frame> = choices.par_iter().map(|c| c.frame(rig, options.points, options.rays)).collect();
+    // Half of the targets, each for two, lead there as well.
+    let half: Vec<Frame> = dense.iter().map(Frame::half).collect();
     step(0.4)?;
     let shaped = if options.lengths { SHAPED } else { STYLED };
-    let approach = Settings { at_skin: false, ..settings };
-    state = run.stage(state, &dense, &ten, &Stage { free: STYLED, settings: Settings { model_m: 0.03, ..approach }, refreshes: 5 });
+    let approach =
+        Settings { at_skin: false, point_weight: 2.0 * settings.point_weight, ray_weight: 2.0 * settings.ray_weight, ..settings };
+    let approaching = |free, settings, refreshes| Stage { free, settings, refreshes, least_change: ROUGHLY };
+    state = run.stage(state, &half, &ten, &approaching(STYLED, Settings { model_m: 0.03, ..approach }, 5));
     step(0.55)?;
     let curve = Curve::new(model, options.variance.map_or(options.components, |part| model.components(part)));
     state.weights.resize(curve.components(), 0.0);
-    state = run.stage(state, &dense, &curve, &Stage { free: shaped, settings: approach, refreshes: 10 });
+    state = run.stage(state, &half, &curve, &approaching(shaped, approach, 10));
     step(0.7)?;
-    let mut last = Stage { free: shaped, settings, refreshes: 10 };
+    let mut last = Stage { free: shaped, settings, refreshes: 10, least_change: CLOSELY };
     if options.deviations {
         let posed = Stage { free: Free { lengths: options.lengths, ..POSED }, ..last };
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };
-        let own = run.stage(own, &dense, &curve, &Stage { settings: approach, ..posed });
+        let own = run.stage(own, &half, &curve, &approaching(posed.free, approach, 10));
         step(0.85)?;
-        let left_out: Vec<Frame> = people.par_iter().map(|p| targets::left_out(p, rig, known.floor_m, options.points)).collect();
+        let left_out: Vec<Frame> = choices.par_iter().map(|c| c.left_out(options.points)).collect();
         let cost = |state: &State| total(&fitness(&curve, &left_out, &settings, &known, state)).cost;
         if cost(&own) < cost(&state) {
             (state, last) = (own, posed);

@@ -10,10 +10,10 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 
-use image::{GrayImage, Luma};
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
+use super::silhouette::Silhouette;
 use super::targets::Observation;
 use crate::clouds::CloudPoint;
 use crate::math::distance_field::DistanceField;
@@ -35,7 +35,7 @@ pub struct Person<'a> {
     observation: &'a Observation,
     points: Vec<u32>,
     /// As in the observation.
-    pub masks: Cow<'a, [Option<GrayImage>]>,
+    pub silhouettes: Cow<'a, [Option<Silhouette>]>,
 }
 
 impl Person<'_> {
@@ -59,37 +59,34 @@ pub fn largest<'a>(observations: &'a [Observation], rig: &Rig) -> (Vec<Person<'a
         let crowd = pieces.len() > 1 && pieces[1].len() as f64 > ANOTHER * most;
         let others: Vec<u32> = pieces.iter().skip(1).filter(|p| p.len() as f64 > SOMEBODY * most).flatten().copied().collect();
         let own = if pieces.is_empty() { Vec::new() } else { pieces.swap_remove(0) };
-        let masks = if others.is_empty() {
-            Cow::Borrowed(observation.masks.as_slice())
+        let silhouettes = if others.is_empty() {
+            Cow::Borrowed(observation.silhouettes.as_slice())
         } else {
             let place = |which: &[u32]| -> Vec<Vector3<f64>> { which.iter().map(|i| points[*i as usize].position).collect() };
             let (own, others) = (place(&own), place(&others));
-            let cut = |(camera, mask): (&Camera, &Option<GrayImage>)| mask.as_ref().map(|mask| own_part(mask, camera, &own, &others));
-            Cow::Owned(rig.cameras.iter().zip(observation.masks.iter()).map(cut).collect())
+            let cut = |(camera, all): (&Camera, &Option<Silhouette>)| all.as_ref().map(|all| own_part(all, camera, &own, &others));
+            Cow::Owned(rig.cameras.iter().zip(observation.silhouettes.iter()).map(cut).collect())
         };
-        (Person { observation, points: own, masks }, crowd)
+        (Person { observation, points: own, silhouettes }, crowd)
     });
     let (people, crowds): (Vec<Person>, Vec<bool>) = each.unzip();
     (people, crowds.into_iter().filter(|crowd| *crowd).count())
 }
 
-/// The pixels of a mask that are not nearer to the points of others than to the person's own.
-fn own_part(mask: &GrayImage, camera: &Camera, own: &[Vector3<f64>], others: &[Vector3<f64>]) -> GrayImage {
-    let (width, height) = (mask.width() as usize, mask.height() as usize);
+/// The pixels that are not nearer to the points of others than to the person's own.
+fn own_part(all: &Silhouette, camera: &Camera, own: &[Vector3<f64>], others: &[Vector3<f64>]) -> Silhouette {
+    let [width, height] = all.size_px();
+    let (columns, rows) = (width.div_ceil(STEP_PX), height.div_ceil(STEP_PX));
     let distances = |points: &[Vector3<f64>]| {
-        let mut seen = vec![false; width.div_ceil(STEP_PX) * height.div_ceil(STEP_PX)];
+        let mut seen = vec![false; columns * rows];
         let cells = points.iter().filter_map(|x| camera.project(x)).filter(|p| p.x >= 0.0 && p.y >= 0.0);
-        let cells = cells.map(|p| (p.x as usize / STEP_PX, p.y as usize / STEP_PX));
-        let inside = cells.filter(|(x, y)| *x < width.div_ceil(STEP_PX) && *y < height.div_ceil(STEP_PX));
-        inside.for_each(|(x, y)| seen[y * width.div_ceil(STEP_PX) + x] = true);
-        DistanceField::new(width, height, STEP_PX, |x, y| seen[y / STEP_PX * width.div_ceil(STEP_PX) + x / STEP_PX])
+        let cells = cells.map(|p| (p.x as usize / STEP_PX, p.y as usize / STEP_PX)).filter(|(x, y)| *x < columns && *y < rows);
+        cells.for_each(|(x, y)| seen[y * columns + x] = true);
+        DistanceField::new(width, height, STEP_PX, |x, y| seen[y / STEP_PX * columns + x / STEP_PX])
     };
     let (to_own, to_others) = (distances(own), distances(others));
     let of = |field: &DistanceField, x: u32, y: u32| field.at(f64::from(x), f64::from(y)).0;
-    GrayImage::from_fn(mask.width(), mask.height(), |x, y| {
-        let pixel = mask.get_pixel(x, y);
-        if pixel.0[0] > 0 && of(&to_others, x, y) < of(&to_own, x, y) { Luma([0]) } else { *pixel }
-    })
+    all.retained(|x, y| of(&to_others, x, y) >= of(&to_own, x, y))
 }
 
 /// The indices `which` of points by pieces, largest first, in the points' order.
@@ -124,6 +121,7 @@ mod tests {
     use super::*;
     use crate::clouds::Cloud;
     use crate::rig::{Lens, Up};
+    use image::{GrayImage, Luma};
     use nalgebra::{Matrix3, Rotation3};
     use std::sync::Arc;
 
@@ -180,19 +178,20 @@ mod tests {
                     *pixel = Luma([255]);
                 }
             }
-            mask
+            Silhouette::new(&mask)
         };
         let of = |people: &[&[CloudPoint]]| Observation {
-            masks: Arc::new(rig.cameras.iter().map(|camera| Some(painted(camera, people))).collect()),
+            silhouettes: Arc::new(rig.cameras.iter().map(|camera| Some(painted(camera, people))).collect()),
             ..observation(people.iter().flat_map(|points| points.iter().cloned()).collect())
         };
         let (alone, both) = ([of(&[&person])], [of(&[&person, &child])]);
         let found = largest(&both, &rig).0;
-        for (k, mask) in found[0].masks.iter().enumerate() {
-            let [cut, own, all] = [mask, &alone[0].masks[k], &both[0].masks[k]].map(|m| m.as_ref().unwrap());
-            let differ = |a: &GrayImage, b: &GrayImage| a.pixels().zip(b.pixels()).filter(|(a, b)| a != b).count();
+        for (k, cut) in found[0].silhouettes.iter().enumerate() {
+            let [cut, own, all] = [cut, &alone[0].silhouettes[k], &both[0].silhouettes[k]].map(|s| s.as_ref().unwrap());
+            let pixels = || (0..480).flat_map(|y| (0..640).map(move |x| (x, y)));
+            let differ = |a: &Silhouette, b: &Silhouette| pixels().filter(|(x, y)| a.contains(*x, *y) != b.contains(*x, *y)).count();
             assert!(20 * differ(cut, own) < differ(all, own), "camera {k}: {} of {}", differ(cut, own), differ(all, own));
         }
-        assert!(matches!(largest(&alone, &rig).0[0].masks, Cow::Borrowed(_)));
+        assert!(matches!(largest(&alone, &rig).0[0].silhouettes, Cow::Borrowed(_)));
     }
 }

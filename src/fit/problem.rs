@@ -54,6 +54,13 @@ pub struct Frame {
     pub outsides: Arc<Vec<Outside>>,
 }
 
+impl Frame {
+    /// With every second target.
+    pub fn half(&self) -> Frame {
+        Frame { time_s: self.time_s, targets: self.targets.iter().step_by(2).cloned().collect(), outsides: self.outsides.clone() }
+    }
+}
+
 /// Standard deviations and weights of equation (1).
 #[derive(Clone, Copy, Debug)]
 pub struct Settings {

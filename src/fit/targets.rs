@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use image::GrayImage;
 use nalgebra::{Matrix3, Point2, Vector3};
 
 use super::people::Person;
 use super::problem::{Frame, Outside, Target};
+use super::silhouette::Silhouette;
 use crate::clouds::{Cloud, CloudPoint};
-use crate::math::distance_field::DistanceField;
 use crate::rig::{Camera, Rig};
 
 /// What the cameras saw of the person at one instant.
@@ -19,8 +18,8 @@ pub struct Observation {
     pub number: usize,
     pub time_s: f64,
     pub cloud: Cloud,
-    /// Silhouette per camera of the rig, raw pixels, 255 inside; `None` where a camera has none.
-    pub masks: Arc<Vec<Option<GrayImage>>>,
+    /// Per camera of the rig; `None` where a camera has none.
+    pub silhouettes: Arc<Vec<Option<Silhouette>>>,
 }
 
 /// Edge of the cubes over which points are averaged: about a correlation window, below which points say the same thing.
@@ -29,43 +28,47 @@ const VOXEL_M: f64 = 0.025;
 const SHADOW_M: f64 = 0.03;
 /// Uncertainty of a mask's outline.
 const OUTLINE_PX: f64 = 1.5;
-/// Cells of the distance to a silhouette: half the memory of pixels in each direction, a centimetre at 3 m.
-const FIELD_STEP_PX: usize = 2;
-/// Outlines this close to the image border are the border's.
-const BORDER_PX: u32 = 3;
 
-/// Distances to the silhouettes of one frame.
-pub fn outsides(person: &Person, rig: &Rig) -> Vec<Outside> {
-    let masks = rig.cameras.iter().zip(person.masks.iter());
-    let known = masks.filter_map(|(camera, mask)| mask.as_ref().map(|m| (camera, m)));
-    known
-        .map(|(camera, mask)| {
-            let (width, height) = (mask.width() as usize, mask.height() as usize);
-            let inside = |x: usize, y: usize| mask.as_raw()[y * width + x] > 127;
-            Outside { camera: camera.clone(), field: DistanceField::new(width, height, FIELD_STEP_PX, inside) }
-        })
-        .collect()
+/// All that one frame's measurements are chosen from.
+#[derive(Clone, Debug)]
+pub struct Choice {
+    time_s: f64,
+    /// Thinned.
+    points: Vec<Target>,
+    /// Per camera, pixels.
+    outlines: Vec<Vec<Point2<f64>>>,
+    outsides: Arc<Vec<Outside>>,
 }
 
-/// At most `points` cloud points and `rays` silhouette rays per camera, evenly chosen; the floor is at height `floor_m`.
-pub fn frame(person: &Person, rig: &Rig, outsides: &Arc<Vec<Outside>>, floor_m: Option<f64>, points: usize, rays: usize) -> Frame {
-    let up = rig.up.direction();
-    let lowest = floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M);
-    let mut targets = evenly(&thinned(person.points(), |x| x.dot(&up) > lowest), points);
-    for (camera, mask) in rig.cameras.iter().zip(person.masks.iter()) {
-        if let Some(mask) = mask {
-            targets.extend(evenly(&outline(mask), rays).iter().filter_map(|pixel| ray(camera, pixel)));
+impl Choice {
+    /// Of a person; the floor is at height `floor_m`.
+    pub fn new(person: &Person, rig: &Rig, floor_m: Option<f64>) -> Choice {
+        let up = rig.up.direction();
+        let lowest = floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M);
+        let seen = rig.cameras.iter().zip(person.silhouettes.iter()).filter_map(|(c, s)| Some((c, s.as_ref()?)));
+        Choice {
+            time_s: person.time_s(),
+            points: thinned(person.points(), |x| x.dot(&up) > lowest),
+            outlines: person.silhouettes.iter().map(|s| s.as_ref().map_or(Vec::new(), Silhouette::outline)).collect(),
+            outsides: Arc::new(seen.map(|(camera, s)| Outside { camera: camera.clone(), field: s.distances() }).collect()),
         }
     }
-    Frame { time_s: person.time_s(), targets, outsides: outsides.clone() }
-}
 
-/// At most `points` of the cloud points that [`frame`] does not choose.
-pub fn left_out(person: &Person, rig: &Rig, floor_m: Option<f64>, points: usize) -> Frame {
-    let all = thinned(person.points(), |x| x.dot(&rig.up.direction()) > floor_m.map_or(f64::NEG_INFINITY, |floor| floor + SHADOW_M));
-    let chosen: Vec<usize> = evenly(&(0..all.len()).collect::<Vec<_>>(), points);
-    let others: Vec<Target> = (0..all.len()).filter(|i| chosen.binary_search(i).is_err()).map(|i| all[i].clone()).collect();
-    Frame { time_s: person.time_s(), targets: evenly(&others, points), outsides: Arc::default() }
+    /// At most `points` cloud points and `rays` silhouette rays per camera, evenly chosen.
+    pub fn frame(&self, rig: &Rig, points: usize, rays: usize) -> Frame {
+        let mut targets = evenly(&self.points, points);
+        for (camera, outline) in rig.cameras.iter().zip(&self.outlines) {
+            targets.extend(evenly(outline, rays).iter().filter_map(|pixel| ray(camera, pixel)));
+        }
+        Frame { time_s: self.time_s, targets, outsides: self.outsides.clone() }
+    }
+
+    /// At most `points` of the cloud points that [`frame`](Self::frame) does not choose.
+    pub fn left_out(&self, points: usize) -> Frame {
+        let chosen: Vec<usize> = evenly(&(0..self.points.len()).collect::<Vec<_>>(), points);
+        let others = (0..self.points.len()).filter(|i| chosen.binary_search(i).is_err()).map(|i| self.points[i].clone());
+        Frame { time_s: self.time_s, targets: evenly(&others.collect::<Vec<_>>(), points), outsides: Arc::default() }
+    }
 }
 
 fn evenly<T: Clone>(items: &[T], wanted: usize) -> Vec<T> {
@@ -88,25 +91,6 @@ fn thinned<'a>(points: impl Iterator<Item = &'a CloudPoint>, wanted: impl Fn(&Ve
     cubes.into_values().map(|(sum, covariance, n)| Target::Point { x: sum / n, covariance: covariance / n }).collect()
 }
 
-/// Points half-way between mask pixels and their 4-neighbours outside, row by row.
-fn outline(mask: &GrayImage) -> Vec<Point2<f64>> {
-    let (width, height) = mask.dimensions();
-    let inside = |x: u32, y: u32| mask.get_pixel(x, y).0[0] > 127;
-    let mut pixels = Vec::new();
-    for y in BORDER_PX..height.saturating_sub(BORDER_PX) {
-        for x in BORDER_PX..width.saturating_sub(BORDER_PX) {
-            if inside(x, y) {
-                for (dx, dy) in [(-1i32, 0i32), (1, 0), (0, -1), (0, 1)] {
-                    if !inside((x as i32 + dx) as u32, (y as i32 + dy) as u32) {
-                        pixels.push(Point2::new(x as f64 + 0.5 * dx as f64, y as f64 + 0.5 * dy as f64));
-                    }
-                }
-            }
-        }
-    }
-    pixels
-}
-
 fn ray(camera: &Camera, pixel: &Point2<f64>) -> Option<Target> {
     let sigma = OUTLINE_PX / camera.matrix[(0, 0)];
     Some(Target::Ray { origin: camera.centre(), direction: camera.ray(pixel)?, sigma })
@@ -115,15 +99,6 @@ fn ray(camera: &Camera, pixel: &Point2<f64>) -> Option<Target> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn outline_of_a_rectangle_runs_along_its_edges() {
-        let mask = GrayImage::from_fn(40, 30, |x, y| image::Luma([if (10..20).contains(&x) && (8..20).contains(&y) { 255 } else { 0 }]));
-        let pixels = outline(&mask);
-        assert_eq!(pixels.len(), 2 * (10 + 12));
-        assert!(pixels.iter().all(|p| p.x == 9.5 || p.x == 19.5 || p.y == 7.5 || p.y == 19.5));
-        assert!(outline(&GrayImage::from_pixel(40, 30, image::Luma([255]))).is_empty());
-    }
 
     #[test]
     fn thinning_averages_cubes_and_keeps_the_rest() {

@@ -9,7 +9,7 @@
 //! front of the body: r = t nᵀd + κ (√d_eff(y) − √d_0), y the front.
 //! Checked against a dense search (rays, lines of sight); the weights enter the Jacobian tests of `problem`.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::curve::Curve;
@@ -135,7 +135,15 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
         surface.evaluate_among(&near, &x, &mut evaluation);
         let is_point = matches!(target, Target::Point { .. });
         let to_skin = settings.at_skin && (!is_point || settings.residual == PointResidual::Distance);
-        let (at, near) = if to_skin { foot(surface, &x, &mut evaluation) } else { (x, near) };
+        let (at, near) = match target {
+            _ if !to_skin => (x, near),
+            Target::Point { covariance, .. } => {
+                let sight = (x - known.viewpoint).normalize();
+                let noise = sight * sight.dot(&(covariance * sight)).sqrt();
+                foot(surface, &x, near, &(covariance + Matrix3::identity() * settings.model_m.powi(2)), &noise, &mut evaluation)
+            }
+            Target::Ray { .. } => foot(surface, &x, near, &Matrix3::identity(), &Vector3::zeros(), &mut evaluation),
+        };
         let normal = evaluation.gradient.normalize();
         let (variance, hidden) = match target {
             Target::Point { covariance, .. } => {
@@ -209,18 +217,40 @@ pub fn total(fitness: &[Fitness]) -> Fitness {
     fitness.iter().fold(Fitness::default(), |sum, f| sum.add(*f))
 }
 
-/// Longest of the two Newton steps to the skin, metres.
+/// Longest step to the skin, metres, and number of steps.
 const TO_SKIN_M: f64 = 0.04;
+const TO_SKIN: usize = 2;
 
-/// The point of the skin nearest to `x` and what makes the skin there; the surface has been evaluated at `x`, and then is there.
-fn foot(surface: &PosedSurface, x: &Vector3<f64>, evaluation: &mut Evaluation) -> (Vector3<f64>, Near) {
-    let step = |e: &Evaluation| e.gradient.normalize() * e.distance().clamp(-TO_SKIN_M, TO_SKIN_M);
-    let first = x - step(evaluation);
-    let near = surface.near(&first, MARGIN, evaluation);
-    surface.evaluate_among(&near, &first, evaluation);
-    let second = first - step(evaluation);
-    surface.evaluate_among(&near, &second, evaluation);
-    (second, near)
+/// The point y of the skin from which `x` comes most probably, with the least (x − y)ᵀ Σ⁻¹ (x − y), and what makes the skin
+/// there; the surface has been evaluated at `x`, and then is there. A point that only the back of the body is near to is first
+/// brought against the line of sight by its own `noise`, once or twice.
+fn foot(
+    surface: &PosedSurface,
+    x: &Vector3<f64>,
+    near: Near,
+    spread: &Matrix3<f64>,
+    noise: &Vector3<f64>,
+    evaluation: &mut Evaluation,
+) -> (Vector3<f64>, Near) {
+    let (mut y, mut near) = (*x, near);
+    for _ in 0..2 {
+        if evaluation.gradient.normalize().dot(noise) > FACING * noise.norm() {
+            y -= noise;
+            near = surface.near(&y, MARGIN, evaluation);
+            surface.evaluate_among(&near, &y, evaluation);
+        }
+    }
+    for step in 0..TO_SKIN {
+        let normal = evaluation.gradient.normalize();
+        let off_m = normal.dot(&(x - y)) + evaluation.distance().clamp(-TO_SKIN_M, TO_SKIN_M);
+        let way = spread * normal;
+        y = x - way * (off_m / normal.dot(&way));
+        if step == 0 {
+            near = surface.near(&y, MARGIN, evaluation);
+        }
+        surface.evaluate_among(&near, &y, evaluation);
+    }
+    (y, near)
 }
 
 /// Steps from within the body to its front, metres, and halvings of the last one: to a hundredth of a millimetre.

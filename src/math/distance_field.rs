@@ -3,11 +3,18 @@
 //! D(x) = min over set pixels p of |x − p|; along columns by counting, along rows as lower envelope of parabolas, O(pixels).
 //! Checked against brute force.
 
-/// Distances in pixels of the grid that it was made from.
+/// Cells around the set ones for which distances are kept.
+const MARGIN: usize = 16;
+
+/// Distances in pixels of the grid that it was made from, kept about the set pixels. Farther off it is the distance to the set
+/// pixel that is nearest to the nearest place of those kept, up to a seventh too much.
 #[derive(Clone, Debug)]
 pub struct DistanceField {
-    width: usize,
-    height: usize,
+    /// Of the whole grid, cells.
+    size: [usize; 2],
+    /// First cell that is kept, and how many are.
+    first: [usize; 2],
+    kept: [usize; 2],
     /// Pixels of the original grid per cell.
     step: f64,
     values: Vec<f32>,
@@ -17,35 +24,67 @@ impl DistanceField {
     /// Distance to the cells where `inside(x, y)`, for a grid of `width` × `height` pixels seen in cells of `step` pixels.
     /// Without any such cell all distances are zero: nothing is known.
     pub fn new(width: usize, height: usize, step: usize, inside: impl Fn(usize, usize) -> bool) -> DistanceField {
-        let (w, h) = (width.div_ceil(step), height.div_ceil(step));
+        let size = [width.div_ceil(step), height.div_ceil(step)];
+        let set: Vec<bool> =
+            (0..size[0] * size[1]).map(|i| inside((i % size[0] * step).min(width - 1), (i / size[0] * step).min(height - 1))).collect();
+        let rows = || set.chunks_exact(size[0].max(1));
+        let beginning = |row: &[bool]| row.iter().position(|s| *s);
+        let around = |least: Option<usize>, most: Option<usize>, k: usize| {
+            let first = least?.saturating_sub(MARGIN);
+            Some((first, (most? + MARGIN + 1).min(size[k]) - first))
+        };
+        let across = around(rows().filter_map(beginning).min(), rows().filter_map(|row| row.iter().rposition(|s| *s)).max(), 0);
+        let down = around(rows().position(|row| row.contains(&true)), rows().rposition(|row| row.contains(&true)), 1);
+        let Some(((left, w), (top, h))) = across.zip(down) else {
+            return DistanceField { size, first: [0; 2], kept: [0; 2], step: step as f64, values: Vec::new() };
+        };
         // Within a column the distance to the nearest set cell, infinite without one.
-        let set = |i: usize| inside((i % w * step).min(width - 1), (i / w * step).min(height - 1));
-        let mut columns: Vec<f64> = (0..w * h).map(|i| if set(i) { 0.0 } else { f64::INFINITY }).collect();
+        let of_cell = |i: usize| if set[(top + i / w) * size[0] + left + i % w] { 0.0 } else { f64::INFINITY };
+        let mut columns: Vec<f64> = (0..w * h).map(of_cell).collect();
         for i in w..w * h {
             columns[i] = columns[i].min(columns[i - w] + 1.0);
         }
-        for i in (0..(w * h).saturating_sub(w)).rev() {
+        for i in (0..w * h - w).rev() {
             columns[i] = columns[i].min(columns[i + w] + 1.0);
         }
         let mut parabolas = Vec::with_capacity(w);
         let mut values = vec![0.0; w * h];
-        for (row, out) in columns.chunks_exact(w.max(1)).zip(values.chunks_exact_mut(w.max(1))) {
+        for (row, out) in columns.chunks_exact(w).zip(values.chunks_exact_mut(w)) {
             lowest(row, &mut parabolas, |x, square| out[x] = (square.sqrt() * step as f64) as f32);
         }
-        DistanceField { width: w, height: h, step: step as f64, values }
+        DistanceField { size, first: [left, top], kept: [w, h], step: step as f64, values }
     }
 
-    /// Bilinear distance and its gradient at pixel (x, y); zero beyond the grid, where nothing is known.
+    /// Distance and its gradient at pixel (x, y); zero beyond the grid, where nothing is known.
     pub fn at(&self, x: f64, y: f64) -> (f64, [f64; 2]) {
-        let (u, v) = (x / self.step, y / self.step);
-        if !(u >= 0.0 && v >= 0.0 && u < (self.width - 1) as f64 && v < (self.height - 1) as f64) {
+        let cell = [x / self.step, y / self.step];
+        if self.values.is_empty() || !(0..2).all(|k| cell[k] >= 0.0 && cell[k] < self.size[k].saturating_sub(1) as f64) {
             return (0.0, [0.0; 2]);
         }
-        let (i, j) = (u as usize, v as usize);
+        let from_first = [0, 1].map(|k| cell[k] - self.first[k] as f64);
+        let nearest = [0, 1].map(|k| from_first[k].clamp(0.0, (self.kept[k] - 1) as f64));
+        let (value, slopes) = self.between(nearest);
+        if nearest == from_first {
+            return (value, slopes);
+        }
+        let beyond = [0, 1].map(|k| (from_first[k] - nearest[k]) * self.step);
+        let steepness = slopes[0].hypot(slopes[1]).max(1e-9);
+        let way = [0, 1].map(|k| beyond[k] + value * slopes[k] / steepness);
+        let length = way[0].hypot(way[1]);
+        let along = (way[0] * slopes[0] + way[1] * slopes[1]) / (steepness * length);
+        (length, [0, 1].map(|k| if beyond[k] == 0.0 { along * slopes[k] } else { way[k] / length }))
+    }
+
+    /// Bilinear value and gradient at a place among the kept cells.
+    fn between(&self, [u, v]: [f64; 2]) -> (f64, [f64; 2]) {
+        let [w, h] = self.kept;
+        // The last cell is the end of the step to it.
+        let (i, j) = ((u as usize).min(w.saturating_sub(2)), (v as usize).min(h.saturating_sub(2)));
         let (a, b) = (u - i as f64, v - j as f64);
-        let value = |di: usize, dj: usize| f64::from(self.values[(j + dj) * self.width + i + di]);
-        let (top, bottom) = (value(0, 0) * (1.0 - a) + value(1, 0) * a, value(0, 1) * (1.0 - a) + value(1, 1) * a);
-        let across = (value(1, 0) - value(0, 0)) * (1.0 - b) + (value(1, 1) - value(0, 1)) * b;
+        let (right, below) = ((i + 1).min(w - 1), (j + 1).min(h - 1));
+        let [p, q, r, s] = [j * w + i, j * w + right, below * w + i, below * w + right].map(|k| f64::from(self.values[k]));
+        let (top, bottom) = (p * (1.0 - a) + q * a, r * (1.0 - a) + s * a);
+        let across = (q - p) * (1.0 - b) + (s - r) * b;
         (top * (1.0 - b) + bottom * b, [across / self.step, (bottom - top) / self.step])
     }
 }
@@ -96,6 +135,34 @@ mod tests {
                 assert!((field.at(x as f64, y as f64).0 - brute).abs() < 1e-5, "{x} {y}");
             }
         }
+    }
+
+    #[test]
+    fn far_off_it_is_little_too_much() {
+        // A figure with an arm stretched out.
+        let set =
+            |x: usize, y: usize| (200..230).contains(&x) && (80..230).contains(&y) || (230..290).contains(&x) && (110..120).contains(&y);
+        let field = DistanceField::new(640, 480, 2, set);
+        assert!(field.values.len() < 640 * 480 / 4 / 4);
+        let edge: Vec<(f64, f64)> = (0..480)
+            .step_by(2)
+            .flat_map(|y| (0..640).step_by(2).map(move |x| (x, y)))
+            .filter(|p| set(p.0, p.1))
+            .map(|p| (p.0 as f64, p.1 as f64))
+            .collect();
+        let mut worst: f64 = 0.0;
+        for (x, y) in (0..47).flat_map(|j| (0..63).map(move |i| (10.0 * i as f64 + 3.3, 10.0 * j as f64 + 1.7))) {
+            let (found, gradient) = field.at(x, y);
+            let ways = edge.iter().map(|(a, b)| [x - a, y - b]);
+            let way = ways.min_by(|p, q| p[0].hypot(p[1]).total_cmp(&q[0].hypot(q[1]))).unwrap();
+            let known = way[0].hypot(way[1]);
+            worst = worst.max(found / known.max(20.0) - 1.0);
+            assert!(found > known - 1.5, "{x} {y}: {found} {known}");
+            // Within 50 degrees it leads away from the nearest pixel.
+            let along = (gradient[0] * way[0] + gradient[1] * way[1]) / known;
+            assert!(known < 64.0 || along > 0.64 * gradient[0].hypot(gradient[1]) && along > 0.6, "{x} {y}: {gradient:?} {way:?}");
+        }
+        assert!(worst < 0.15, "{worst}");
     }
 
     #[test]

@@ -4,19 +4,19 @@
 //! and the bends of knee and toes, all on the right of the motion's own rotations. With p_i(t) the heel, ball and toe tip, y_i
 //! their heights and u_k the unknowns by their scales,
 //!   min ∫ Σ_k (c_k u_k² + τ_k⁴ ü_k²) + Σ_i w_i (ẋ_i² + ż_i²)/σ_v² + Σ_i v_i (y_i − y_i*)²/σ_y² dt                 (1)
-//! During a contact w_i = b(h_i/h0), h_i the height over the foot's lowest point and b(r) = (1 − r²)²: the heel stands first,
+//! During a contact w_i = b(h_i/h0), h_i the height y_i* over the foot's lowest point and b(r) = (1 − r²)²: the heel stands first,
 //! then all of the foot, then ball and toe tip while the foot turns about its toes; who touches with the tip alone may pivot
 //! on it. v_i = b(height over the floor/h1): feet come down where they did. y_i* is the own height, in the midst of a contact
 //! the floor's where the point is under or little over it: the toes of recordings flutter there, and a toe that turns drags the
-//! ball along. c_k is 1, and `FREE` squared for a leg that does not stand. Everything is a difference of neighbouring frames, so
-//! the equations are a band of three frames.
+//! ball along. c_k is 1; for a joint of a leg that does not stand it is `FREE`, and c_k u is u `FREE` (1 + |u|²/`FREE_RAD`²): a large
+//! change grows stiff. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
 //! Checked against central differences.
 
 use std::ops::Range;
 
 use nalgebra::{DVector, SMatrix, Vector3};
 
-use super::contact::{FootTrack, lowest_m};
+use super::contact::FootTrack;
 use crate::body::{Clip, Joint, Pose, place};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::rotation::{exp, hat, left_jacobian};
@@ -40,6 +40,10 @@ const SHIFT_M: f64 = 0.01;
 /// How much more a joint's change weighs while its foot does not stand. Less lets the swing change as much as the stance; more
 /// only hastens the changes at touch-down.
 const FREE: f64 = 8.0;
+/// Change of hip, knee or ankle at which that doubles. Less jerks where takes are noisy.
+const FREE_RAD: f64 = 0.06;
+/// Unknowns of hip, knee and ankle within a leg's.
+const JOINTS: [Range<usize>; 3] = [0..3, 3..4, 4..7];
 /// τ of legs and root, seconds. Shorter jerks, longer changes the swing, or for the root leaves more to the legs.
 const LEG_S: f64 = 0.08;
 const ROOT_S: f64 = 0.2;
@@ -96,7 +100,7 @@ impl Foot {
                 foot.heights[frame].iter_mut().for_each(|y| *y += share * (pressed(*y) - *y));
             }
             for frame in contact.start..contact.end - 1 {
-                let [u, v] = [frame, frame + 1].map(|t| touching(&track.soles[t]));
+                let [u, v] = [frame, frame + 1].map(|t| touching(&foot.heights[t]));
                 foot.touching[frame] = std::array::from_fn(|i| 0.5 * (u[i] + v[i]));
             }
         }
@@ -114,10 +118,11 @@ fn pressed(height_m: f64) -> f64 {
     over * (1.0 - bump(over / PRESSED_M))
 }
 
-/// w_i of a sole; 1 for its lowest point.
-fn touching(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
-    let lowest = lowest_m(sole);
-    sole.map(|p| bump((p.y.max(0.0) - lowest) / TOUCH_M))
+/// w_i of a sole from the heights that its points are to have; 1 for the lowest.
+fn touching(heights: &[f64; 3]) -> [f64; 3] {
+    let over = heights.map(|y| y.max(0.0));
+    let lowest = over.into_iter().fold(f64::INFINITY, f64::min);
+    over.map(|y| bump((y - lowest) / TOUCH_M))
 }
 
 fn vector(x: &[f64]) -> Vector3<f64> {
@@ -214,14 +219,37 @@ impl<'a> Footing<'a> {
                 _ if (k - ROOT) % LEG == LEG - 1 => (TOES, LEG_S),
                 _ => (JOINT, LEG_S),
             };
-            let free = k >= ROOT && !self.feet[(k - ROOT) / LEG].stands[t];
-            let factor = dt_s.sqrt() / scale * if free { FREE } else { 1.0 };
             let at = t * UNKNOWNS + k;
-            take(factor * state[t][k], &[(at, factor)]);
+            if k < ROOT || self.feet[(k - ROOT) / LEG].stands[t] {
+                let factor = dt_s.sqrt() / scale;
+                take(factor * state[t][k], &[(at, factor)]);
+            } else if (k - ROOT) % LEG == LEG - 1 {
+                let factor = FREE * dt_s.sqrt() / scale;
+                take(factor * state[t][k], &[(at, factor)]);
+            }
             if t > 0 && t + 1 < state.len() {
                 let factor = dt_s.sqrt() / scale * (tau_s / dt_s).powi(2);
                 let bend = state[t - 1][k] - 2.0 * state[t][k] + state[t + 1][k];
                 take(factor * bend, &[(at - UNKNOWNS, factor), (at, -2.0 * factor), (at + UNKNOWNS, factor)]);
+            }
+        }
+        for (t, side) in (0..state.len()).flat_map(|t| [(t, 0), (t, 1)]).filter(|(t, side)| !self.feet[*side].stands[*t]) {
+            for joint in JOINTS {
+                let first = ROOT + side * LEG + joint.start;
+                let u = &state[t][first..][..joint.len()];
+                let over = u.iter().map(|v| v * v).sum::<f64>() / FREE_RAD.powi(2);
+                let factor = FREE * dt_s.sqrt() / JOINT;
+                for (i, value) in u.iter().enumerate() {
+                    let by = |(j, other)| {
+                        (
+                            t * UNKNOWNS + first + j,
+                            factor * (f64::from(u8::from(i == j)) * (1.0 + over) + 2.0 * value * other / FREE_RAD.powi(2)),
+                        )
+                    };
+                    let mut terms = [(0, 0.0); 3];
+                    terms.iter_mut().zip(u.iter().enumerate().map(by)).for_each(|(term, found)| *term = found);
+                    take(factor * value * (1.0 + over), &terms[..joint.len()]);
+                }
             }
         }
     }

@@ -147,12 +147,16 @@ fn undistort_brown_conrady(terms: &[f64; 8], drawn: &Vector2<f64>) -> Option<Vec
 
 /// Whether r g(r^2) rises all the way to this radius, without a pole.
 fn rises_until(terms: &[f64; 8], r2: f64) -> bool {
-    (1..=FOLD_STEPS).all(|k| {
-        let share = f64::from(k) / f64::from(FOLD_STEPS);
-        let r2 = r2 * share * share;
-        let [g, slope] = radial(terms, r2);
-        fraction(terms, r2)[1] > 0.0 && g + 2.0 * r2 * slope > 0.0
-    })
+    let [k1, k2, _, _, k3, k4, k5, k6] = *terms;
+    let steepest = r2 * (3.0 * k1.abs() + r2 * (5.0 * k2.abs() + r2 * 7.0 * k3.abs()));
+    let plain = [k4, k5, k6] == [0.0; 3] && steepest < 1.0;
+    plain
+        || (1..=FOLD_STEPS).all(|k| {
+            let share = f64::from(k) / f64::from(FOLD_STEPS);
+            let r2 = r2 * share * share;
+            let [g, slope] = radial(terms, r2);
+            fraction(terms, r2)[1] > 0.0 && g + 2.0 * r2 * slope > 0.0
+        })
 }
 
 /// theta_d of (2) and its derivative.

@@ -6,6 +6,10 @@
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
+use muybridge::io::manifest::{Entry, find_motions};
+use muybridge::io::read_clip;
+use muybridge::motion_model::{Activity, Cycle, Label, segment};
+use rayon::prelude::*;
 
 /// A folder of the recordings beside the project; `None`, said, where they are not.
 pub fn mocap(folder: &str) -> Option<PathBuf> {
@@ -14,6 +18,25 @@ pub fn mocap(folder: &str) -> Option<PathBuf> {
         println!("skipped: {} is not there", path.display());
     }
     path.exists().then_some(path)
+}
+
+/// The cycles of one recording, named after its file; none where it is no motion or cannot be cut.
+pub fn cut(entry: &Entry, activity: Activity) -> Vec<Cycle> {
+    let Ok(read) = read_clip(&entry.path) else { return Vec::new() };
+    let label = Label {
+        subject: entry.subject.clone(),
+        source: entry.path.file_stem().unwrap().to_string_lossy().into_owned(),
+        activity,
+        parameter: entry.parameter,
+        start_s: entry.start_s,
+        end_s: entry.end_s,
+    };
+    segment(&read.clip, &label).map(|s| s.cycles).unwrap_or_default()
+}
+
+/// The cycles of all recordings in a folder beside the project; `None`, said, where it is not.
+pub fn cycles(folder: &str, activity: Activity) -> Option<Vec<Cycle>> {
+    Some(find_motions(&[mocap(folder)?], None).unwrap().par_iter().flat_map(|entry| cut(entry, activity)).collect())
 }
 
 /// Runs the program: whether it succeeded, what it said, what it complained of.

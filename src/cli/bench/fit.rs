@@ -95,7 +95,7 @@ fn ablate(folder: &Path, model: &Model) -> Result<()> {
     Ok(())
 }
 
-/// Clouds and masks of the session's first `cameras` cameras.
+/// Clouds and silhouettes of the session's first `cameras` cameras.
 fn look(session: &Session, cameras: usize) -> Result<Seen> {
     let options = CloudOptions::default();
     let mut part = session.clone();
@@ -110,7 +110,7 @@ fn look(session: &Session, cameras: usize) -> Result<Seen> {
 fn fitted(seen: &Seen, model: &Model, variant: &Variant) -> Result<Fit> {
     let mut observations = seen.observations.clone();
     if !variant.silhouettes {
-        observations.iter_mut().flat_map(|o| Arc::make_mut(&mut o.masks)).for_each(|mask| *mask = None);
+        observations.iter_mut().flat_map(|o| Arc::make_mut(&mut o.silhouettes)).for_each(|s| *s = None);
     }
     Ok(fit::fit(&observations, &seen.rig, &[model], seen.floor_m, &variant.options, &|_| !interrupt::came())?)
 }

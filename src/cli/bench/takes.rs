@@ -5,7 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use muybridge::body::{NODES, Pose, Shape, Surface, place};
 use muybridge::clouds::{Cloud, CloudPoint};
-use muybridge::fit::{self, Candidate, Fit, FitError, FitOptions, Observation};
+use muybridge::fit::{self, Candidate, Fit, FitError, FitOptions, Observation, Silhouette};
 use muybridge::motion::{Length, play_cycle};
 use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{Figure, SightOptions, joint_errors, sighting, staging, truth::Positions};
@@ -150,7 +150,7 @@ pub fn positions(shape: &Shape, poses: &[Pose]) -> Vec<[Vector3<f64>; NODES]> {
     poses.iter().map(|p| place(&offsets, p).positions).collect()
 }
 
-/// Clouds and masks of a posed body; `frames` are numbers and times.
+/// Clouds and silhouettes of a posed body; `frames` are numbers and times.
 pub fn observe(rig: &Rig, shape: &Shape, frames: &[(usize, f64)], poses: &[Pose], sight: &SightOptions) -> Result<Vec<Observation>> {
     let groups = groups(rig)?;
     let (surface, offsets) = (Surface::new(shape), shape.offsets());
@@ -159,8 +159,8 @@ pub fn observe(rig: &Rig, shape: &Shape, frames: &[(usize, f64)], poses: &[Pose]
         let sighted = |group: &Rectification| sighting::points(&figure, group, number, sight);
         let points = groups.iter().flat_map(sighted);
         let point = |(position, covariance)| CloudPoint { position, colour: [128; 3], confidence: 1.0, covariance };
-        let masks = sighting::masks(&figure, rig, number, sight).into_iter().map(Some).collect();
-        Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, masks: Arc::new(masks) }
+        let silhouettes = sighting::masks(&figure, rig, number, sight).iter().map(|mask| Some(Silhouette::new(mask))).collect();
+        Observation { number, time_s, cloud: Cloud { points: points.map(point).collect() }, silhouettes: Arc::new(silhouettes) }
     };
     Ok(frames.par_iter().zip(poses).map(of_frame).collect())
 }
