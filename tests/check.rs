@@ -1,15 +1,17 @@
 //! `muybridge check` on footage of the phantom with one thing wrong at a time: it names the thing and the remedy.
 
+mod common;
+
 use assert_cmd::Command;
+use common::{half_lab, walk_across};
 use image::{GrayImage, Luma, imageops};
 use muybridge::footage::check::masks;
 use muybridge::footage::epipolar::pair_matches;
 use muybridge::footage::misfit::{Change, Fault, diagnose};
 use muybridge::footage::person::{Doubt, Person, measure};
 use muybridge::io::calib_toml;
-use muybridge::motion::{Length, play_cycle};
 use muybridge::motion_model::{Activity, synthetic};
-use muybridge::phantom::{Scene, Stage, View, render, render_stage, staging};
+use muybridge::phantom::{Scene, Stage, View, render, render_stage};
 use muybridge::rig::{Camera, Rig, Up};
 use nalgebra::{Rotation3, Vector3};
 use std::fs;
@@ -38,14 +40,8 @@ fn footage() -> &'static Footage {
 }
 
 fn film() -> Footage {
-    let mut rig = calib_toml::read_rig(&Path::new(env!("CARGO_MANIFEST_DIR")).join("calib/phantom_lab.toml")).unwrap();
-    rig.cameras.iter_mut().for_each(halve);
-    let subject = synthetic::subject(Activity::Walking, SUBJECT);
-    let (shape, fps) = (subject.shape(), FPS * PARTS as f64);
-    let clip = play_cycle(&subject.cycle(1.3, 0), &shape.offsets(), fps, Length::Seconds(FRAMES as f64 / FPS));
-    let heading = staging::crossing_heading(&rig);
-    let start = staging::cross_the_view(&rig, &clip, &shape, heading).unwrap();
-    let poses = staging::poses_in_world(&clip, &shape, rig.up, start, heading);
+    let rig = half_lab();
+    let (shape, poses) = walk_across(&rig, SUBJECT, 1.3, FPS * PARTS as f64, FRAMES as f64 / FPS);
     let path: Vec<_> = poses.iter().map(|p| p.root).collect();
     let scene = Scene::new(Stage::around(&rig, &path), &shape);
     let views: Vec<View> = rig.cameras.iter().enumerate().map(|(k, camera)| View::new(&scene.stage, camera, k)).collect();
@@ -55,14 +51,6 @@ fn film() -> Footage {
         frames: views.iter().map(|view| take(view, 0)).collect(),
         late: take(&views[2], 1),
         rig,
-    }
-}
-
-/// The camera with pictures of half the size.
-fn halve(camera: &mut Camera) {
-    camera.size_px = camera.size_px.map(|s| s / 2);
-    for (row, column) in [(0, 0), (1, 1), (0, 2), (1, 2)] {
-        camera.matrix[(row, column)] /= 2.0;
     }
 }
 

@@ -1,19 +1,20 @@
 //! Footage with something wrong in it, through the program: what can be tracked is, with the frames named that were left to their
 //! neighbours; the rest is one sentence.
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use std::sync::OnceLock;
 
 use assert_cmd::Command;
+use common::{half_lab, walk_across};
 use image::GrayImage;
 use muybridge::body::{Pose, Shape};
 use muybridge::io::calib_toml;
 use muybridge::io::joints_csv;
-use muybridge::motion::{Length, play_cycle};
-use muybridge::motion_model::{Activity, synthetic};
-use muybridge::phantom::{Scene, Stage, View, mask, render, render_stage, staging};
+use muybridge::phantom::{Scene, Stage, View, mask, render, render_stage};
 use muybridge::rig::Rig;
 use nalgebra::Vector3;
 
@@ -34,17 +35,8 @@ struct Film {
 fn film() -> &'static Film {
     static FILM: OnceLock<Film> = OnceLock::new();
     FILM.get_or_init(|| {
-        let mut rig = calib_toml::read_rig(&Path::new(env!("CARGO_MANIFEST_DIR")).join("calib/phantom_lab.toml")).unwrap();
-        for camera in &mut rig.cameras {
-            camera.size_px = camera.size_px.map(|s| s / 2);
-            [(0, 0), (1, 1), (0, 2), (1, 2)].into_iter().for_each(|at| camera.matrix[at] /= 2.0);
-        }
-        let subject = synthetic::subject(Activity::Walking, 7);
-        let shape = subject.shape();
-        let clip = play_cycle(&subject.cycle(1.2, 0), &shape.offsets(), FPS, Length::Seconds((FRAMES - 1) as f64 / FPS));
-        let heading = staging::crossing_heading(&rig);
-        let start = staging::cross_the_view(&rig, &clip, &shape, heading).unwrap();
-        let poses = staging::poses_in_world(&clip, &shape, rig.up, start, heading);
+        let rig = half_lab();
+        let (shape, poses) = walk_across(&rig, 7, 1.2, FPS, (FRAMES - 1) as f64 / FPS);
         let middle = poses[FRAMES / 2].root;
         let level = |v: Vector3<f64>| v - rig.up.direction() * v.dot(&rig.up.direction());
         let behind = level(middle - rig.cameras[0].centre()).normalize() * 1.7;

@@ -8,8 +8,8 @@
 //! then all of the foot, then ball and toe tip while the foot turns about its toes; who touches with the tip alone may pivot
 //! on it. v_i = b(height over the floor/h1): feet come down where they did. y_i* is the own height, in the midst of a contact
 //! the floor's where the point is under or little over it: the toes of recordings flutter there, and a toe that turns drags the
-//! ball along. c_k is 1; for a joint of a leg that does not stand it is `FREE`, and c_k u is u `FREE` (1 + |u|²/`FREE_RAD`²): a large
-//! change grows stiff. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
+//! ball along. c_k is 1; for toes of a leg that does not stand `FREE` squared, for its joints that times (1 + |u|²/`FREE_RAD`²)²:
+//! large changes grow stiff. Everything is a difference of neighbouring frames, so the equations are a band of three frames.
 //! Checked against central differences.
 
 use std::ops::Range;
@@ -187,6 +187,7 @@ impl<'a> Footing<'a> {
     /// Every residual of (1) with its derivatives by unknowns, places increasing.
     fn residuals(&self, state: &[Unknowns], mut take: impl FnMut(f64, &[(usize, f64)])) {
         self.calm(state, &mut take);
+        self.swing(state, &mut take);
         let dt_s = 1.0 / self.clip.fps;
         let soles: Vec<_> = state.iter().enumerate().map(|(t, x)| self.soles(t, x)).collect();
         for (t, side) in (0..state.len()).flat_map(|t| [(t, 0), (t, 1)]) {
@@ -209,7 +210,7 @@ impl<'a> Footing<'a> {
         }
     }
 
-    /// The first two terms of (1).
+    /// The first two terms of (1), but for [`swing`](Self::swing).
     fn calm(&self, state: &[Unknowns], take: &mut impl FnMut(f64, &[(usize, f64)])) {
         let dt_s = 1.0 / self.clip.fps;
         for (t, k) in (0..state.len()).flat_map(|t| (0..UNKNOWNS).map(move |k| (t, k))) {
@@ -220,11 +221,9 @@ impl<'a> Footing<'a> {
                 _ => (JOINT, LEG_S),
             };
             let at = t * UNKNOWNS + k;
-            if k < ROOT || self.feet[(k - ROOT) / LEG].stands[t] {
-                let factor = dt_s.sqrt() / scale;
-                take(factor * state[t][k], &[(at, factor)]);
-            } else if (k - ROOT) % LEG == LEG - 1 {
-                let factor = FREE * dt_s.sqrt() / scale;
+            let free = k >= ROOT && !self.feet[(k - ROOT) / LEG].stands[t];
+            if !free || (k - ROOT) % LEG == LEG - 1 {
+                let factor = dt_s.sqrt() / scale * if free { FREE } else { 1.0 };
                 take(factor * state[t][k], &[(at, factor)]);
             }
             if t > 0 && t + 1 < state.len() {
@@ -233,22 +232,23 @@ impl<'a> Footing<'a> {
                 take(factor * bend, &[(at - UNKNOWNS, factor), (at, -2.0 * factor), (at + UNKNOWNS, factor)]);
             }
         }
+    }
+
+    /// The first term of (1) for hips, knees and ankles of legs that do not stand.
+    fn swing(&self, state: &[Unknowns], take: &mut impl FnMut(f64, &[(usize, f64)])) {
+        let factor = FREE / (self.clip.fps.sqrt() * JOINT);
         for (t, side) in (0..state.len()).flat_map(|t| [(t, 0), (t, 1)]).filter(|(t, side)| !self.feet[*side].stands[*t]) {
             for joint in JOINTS {
                 let first = ROOT + side * LEG + joint.start;
                 let u = &state[t][first..][..joint.len()];
-                let over = u.iter().map(|v| v * v).sum::<f64>() / FREE_RAD.powi(2);
-                let factor = FREE * dt_s.sqrt() / JOINT;
+                let stiffness = 1.0 + u.iter().map(|v| v * v).sum::<f64>() / FREE_RAD.powi(2);
                 for (i, value) in u.iter().enumerate() {
-                    let by = |(j, other)| {
-                        (
-                            t * UNKNOWNS + first + j,
-                            factor * (f64::from(u8::from(i == j)) * (1.0 + over) + 2.0 * value * other / FREE_RAD.powi(2)),
-                        )
-                    };
                     let mut terms = [(0, 0.0); 3];
-                    terms.iter_mut().zip(u.iter().enumerate().map(by)).for_each(|(term, found)| *term = found);
-                    take(factor * value * (1.0 + over), &terms[..joint.len()]);
+                    for (j, other) in u.iter().enumerate() {
+                        let own = if i == j { stiffness } else { 0.0 };
+                        terms[j] = (t * UNKNOWNS + first + j, factor * (own + 2.0 * value * other / FREE_RAD.powi(2)));
+                    }
+                    take(factor * value * stiffness, &terms[..u.len()]);
                 }
             }
         }

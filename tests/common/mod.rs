@@ -6,9 +6,13 @@
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
+use muybridge::body::{Pose, Shape};
 use muybridge::io::manifest::{Entry, find_motions};
-use muybridge::io::read_clip;
-use muybridge::motion_model::{Activity, Cycle, Label, segment};
+use muybridge::io::{calib_toml, read_clip};
+use muybridge::motion::{Length, play_cycle};
+use muybridge::motion_model::{Activity, Cycle, Label, segment, synthetic};
+use muybridge::phantom::staging;
+use muybridge::rig::Rig;
 use rayon::prelude::*;
 
 /// A folder of the recordings beside the project; `None`, said, where they are not.
@@ -37,6 +41,27 @@ pub fn cut(entry: &Entry, activity: Activity) -> Vec<Cycle> {
 /// The cycles of all recordings in a folder beside the project; `None`, said, where it is not.
 pub fn cycles(folder: &str, activity: Activity) -> Option<Vec<Cycle>> {
     Some(find_motions(&[mocap(folder)?], None).unwrap().par_iter().flat_map(|entry| cut(entry, activity)).collect())
+}
+
+/// The phantom's lab with pictures of half the size.
+pub fn half_lab() -> Rig {
+    let mut rig = calib_toml::read_rig(&Path::new(env!("CARGO_MANIFEST_DIR")).join("calib/phantom_lab.toml")).unwrap();
+    for camera in &mut rig.cameras {
+        camera.size_px = camera.size_px.map(|s| s / 2);
+        [(0, 0), (1, 1), (0, 2), (1, 2)].into_iter().for_each(|at| camera.matrix[at] /= 2.0);
+    }
+    rig
+}
+
+/// A synthetic person's walk across the view of a rig, in the rig's world.
+pub fn walk_across(rig: &Rig, person: u64, speed_m_s: f64, fps: f64, seconds: f64) -> (Shape, Vec<Pose>) {
+    let subject = synthetic::subject(Activity::Walking, person);
+    let shape = subject.shape();
+    let clip = play_cycle(&subject.cycle(speed_m_s, 0), &shape.offsets(), fps, Length::Seconds(seconds));
+    let heading = staging::crossing_heading(rig);
+    let start = staging::cross_the_view(rig, &clip, &shape, heading).unwrap();
+    let poses = staging::poses_in_world(&clip, &shape, rig.up, start, heading);
+    (shape, poses)
 }
 
 /// Runs the program: whether it succeeded, what it said, what it complained of.

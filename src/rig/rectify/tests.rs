@@ -281,3 +281,26 @@ fn impossible_groups_are_refused_and_groups_cover_every_camera() {
     rig.cameras[1].camera_from_world = turned;
     assert!(matches!(rectify(&rig, &[0, 1]), Err(RectifyError::Directions(..))));
 }
+
+#[test]
+fn pictures_without_their_lens_are_opencvs() {
+    use opencv::{calib3d, core, prelude::*};
+    let mut camera = random_rig(&mut ChaCha8Rng::seed_from_u64(3), false).cameras.swap_remove(0);
+    let terms = [-0.28, 0.09, 1e-3, -2e-3, 0.0];
+    camera.lens = crate::rig::Lens::brown_conrady(&terms).unwrap();
+    let shade = |x: u32, y: u32| 128.0 + 60.0 * (f64::from(x) / 9.0).sin() + 50.0 * (f64::from(y) / 7.0).cos();
+    let picture = GrayImage::from_fn(640, 480, |x, y| Luma([shade(x, y).round() as u8]));
+    let ours = without_lens(&camera, &picture);
+    let mat = |m: &[f64], rows: i32| core::Mat::new_rows_cols_with_data(rows, m.len() as i32 / rows, m).unwrap().try_clone().unwrap();
+    let raw = core::Mat::new_rows_cols_with_data(480, 640, picture.as_raw()).unwrap();
+    let mut theirs = core::Mat::default();
+    let matrix = mat(camera.matrix.transpose().as_slice(), 3);
+    calib3d::undistort(&raw, &mut theirs, &matrix, &mat(&terms, 1), &matrix).unwrap();
+    // OpenCV's places are rounded to 1/32 px; at the very border it mixes black in.
+    let inside =
+        ours.enumerate_pixels().zip(theirs.data_bytes().unwrap()).filter(|((x, y, _), _)| (8..632).contains(x) && (8..472).contains(y));
+    let differences: Vec<u8> = inside.map(|((_, _, ours), theirs)| ours.0[0].abs_diff(*theirs)).collect();
+    assert!(differences.iter().all(|d| *d <= 2), "{:?}", differences.iter().max());
+    let moved = ours.iter().zip(picture.iter()).filter(|(a, b)| a.abs_diff(**b) > 10).count();
+    assert!(moved > 640 * 480 / 3, "{moved}");
+}
