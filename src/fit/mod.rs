@@ -153,7 +153,7 @@ struct Stage {
 }
 
 /// For stages that only lead to the next one: after more rounds of theirs the last one ends at the same place.
-const ROUGHLY: f64 = 1e-2;
+const ROUGHLY: f64 = 3e-2;
 /// Larger ends up to half a degree early.
 const CLOSELY: f64 = 3e-4;
 
