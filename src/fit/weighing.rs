@@ -333,6 +333,32 @@ mod tests {
     }
 
     #[test]
+    fn a_noisy_point_comes_from_the_most_probable_of_the_skin_that_is_seen() {
+        let surface = PosedSurface::new(
+            &Surface::ball(Joint::Root, 0.05),
+            &place(&Shape::template(1.7).offsets(), &Pose::rest(Vector3::new(0.0, 4.0, 1.0))),
+        );
+        let centre = surface.primitives[0].centre;
+        let sight = (centre - KNOWN.viewpoint).normalize();
+        let across = sight.cross(&Vector3::z()).normalize();
+        let covariance = sight * sight.transpose() * 0.06f64.powi(2) + Matrix3::identity() * 0.002f64.powi(2);
+        let settings = Settings { model_m: 0.004, ..SETTINGS };
+        let spread = covariance + Matrix3::identity() * settings.model_m.powi(2);
+        // Before, within and behind the ball, also where only its back is near.
+        for (deep_m, aside_m) in [(-0.1, 0.0), (-0.06, 0.02), (-0.02, 0.01), (0.03, 0.0), (0.04, 0.015), (0.08, -0.02)] {
+            let x = centre + sight * deep_m + across * aside_m;
+            let frame = Frame { targets: vec![Target::Point { x, covariance }], ..Frame::default() };
+            let found = freeze(&frame, &surface, &settings, &KNOWN).0.remove(0).x;
+            let skin = (0..200).flat_map(|i| (0..400).map(move |j| (i as f64 * 0.00785, j as f64 * 0.0157)));
+            let down = sight.cross(&across);
+            let front = skin.map(|(a, b)| centre + (-sight * a.cos() + (across * b.cos() + down * b.sin()) * a.sin()) * 0.05);
+            let far = |y: &Vector3<f64>| (x - y).dot(&(spread.try_inverse().unwrap() * (x - y)));
+            let known = front.min_by(|p, q| far(p).total_cmp(&far(q))).unwrap();
+            assert!((found - known).norm() < 0.004, "{deep_m} {aside_m}: {:?} {:?}", found - centre, known - centre);
+        }
+    }
+
+    #[test]
     fn front_is_the_first_skin_of_a_dense_search() {
         let model = made_up_model(3);
         let curve = Curve::new(&model, 3);

@@ -148,6 +148,7 @@ fn undistort_brown_conrady(terms: &[f64; 8], drawn: &Vector2<f64>) -> Option<Vec
 /// Whether r g(r^2) rises all the way to this radius, without a pole.
 fn rises_until(terms: &[f64; 8], r2: f64) -> bool {
     let [k1, k2, _, _, k3, k4, k5, k6] = *terms;
+    // Polynomials that cannot bend so much by there need no search.
     let steepest = r2 * (3.0 * k1.abs() + r2 * (5.0 * k2.abs() + r2 * 7.0 * k3.abs()));
     let plain = [k4, k5, k6] == [0.0; 3] && steepest < 1.0;
     plain
