@@ -5,7 +5,6 @@ mod common;
 use common::{cut, cycles, mocap};
 use muybridge::body::{Clip, Pose};
 use muybridge::io::manifest::find_motions;
-use muybridge::io::read_clip;
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, CadenceLaw, Cycle, Label, Model, SAMPLES, database, segment, synthetic};
 use muybridge::style::validate::validate;
