@@ -204,6 +204,9 @@ def glb():
     seed("glb", "same_mesh", chunked(text | {"meshes": drawn, "nodes": text["nodes"] + [{"mesh": 0}] * 1000}, blob), "bad")
     many = text["animations"][0] | {"channels": [target("rotation", 0)]}
     seed("glb", "many_bones", chunked(text | {"nodes": text["nodes"] + [{}] * 8000, "animations": [many] * 200}, blob), "bad")
+    for name, moved in [("unknown_path", {"node": 1, "path": "ro,ation"}), ("target_beyond", {"node": 9, "path": "rotation"})]:
+        moving = text["animations"][0] | {"channels": [{"sampler": 0, "target": moved}]}
+        seed("glb", name, chunked(text | {"animations": [moving]}, blob), "bad")
     sparse = {"count": 1, "indices": {"bufferView": 3, "componentType": 5123}, "values": {"bufferView": 0}}
     zeros = accessors[0] | {"count": 2**31, "sparse": sparse}
     del zeros["bufferView"]

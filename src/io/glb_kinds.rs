@@ -3,6 +3,7 @@
 
 use gltf::accessor::{Accessor, DataType, Dimensions};
 use gltf::animation::Property;
+use gltf::json::validation::Validate;
 use gltf::mesh::Semantic;
 
 use DataType::{F32, I8, I16, U8, U16, U32};
@@ -15,6 +16,7 @@ type Kinds = (&'static [Dimensions], &'static [DataType]);
 const PARTS: &[DataType] = &[I8, U8, I16, U16, F32];
 
 pub(super) fn check_kinds(document: &gltf::Document) -> Result<(), String> {
+    check_targets(document.as_json())?;
     for primitive in document.meshes().flat_map(|mesh| mesh.primitives().collect::<Vec<_>>()) {
         for (semantic, accessor) in primitive.attributes() {
             check(&accessor, attribute(&semantic), &format!("{semantic:?}").to_lowercase())?;
@@ -35,6 +37,18 @@ pub(super) fn check_kinds(document: &gltf::Document) -> Result<(), String> {
             Property::MorphTargetWeights => ((&[Scalar], PARTS), "weights of shapes"),
         };
         check(&channel.sampler().output(), Some(kinds), what)?;
+    }
+    Ok(())
+}
+
+/// What channels move; the crate checks everything else of a file.
+fn check_targets(root: &gltf::json::Root) -> Result<(), String> {
+    for (index, animation) in root.animations.iter().enumerate() {
+        let mut sound = true;
+        animation.channels.iter().for_each(|channel| channel.target.validate(root, gltf::json::Path::new, &mut |_, _| sound = false));
+        if !sound {
+            return Err(format!("a channel of animation {index} moves what is not there; the file is damaged, export it again"));
+        }
     }
     Ok(())
 }
