@@ -207,6 +207,7 @@ def glb():
     for name, moved in [("unknown_path", {"node": 1, "path": "ro,ation"}), ("target_beyond", {"node": 9, "path": "rotation"})]:
         moving = text["animations"][0] | {"channels": [{"sampler": 0, "target": moved}]}
         seed("glb", name, chunked(text | {"animations": [moving]}, blob), "bad")
+    seed("glb", "no_accessors", chunked(text | {"accessors": []}, blob), "bad")
     sparse = {"count": 1, "indices": {"bufferView": 3, "componentType": 5123}, "values": {"bufferView": 0}}
     zeros = accessors[0] | {"count": 2**31, "sparse": sparse}
     del zeros["bufferView"]

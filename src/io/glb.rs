@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Matrix4, Quaternion, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 
-use super::glb_kinds::check_kinds;
+use super::glb_kinds::{check_corners, check_kinds};
 use super::glb_tracks::motions;
 use super::write_atomic;
 use crate::animal::creature::{Bone, Creature, Local, Motion, Skin, Vertex};
@@ -44,20 +44,23 @@ pub fn read(path: &Path) -> Result<Creature, GlbError> {
     if bytes.starts_with(b"glTF") && length < HEADER {
         return Err(GlbError::Format { path: path.into(), why: "its header promises less than itself".into() });
     }
-    let file = gltf::Gltf::from_slice(&bytes).map_err(|e| GlbError::Format { path: path.into(), why: e.to_string() })?;
+    let format = |e: gltf::Error| GlbError::Format { path: path.into(), why: e.to_string() };
+    let file = gltf::Gltf::from_slice_without_validation(&bytes).map_err(format)?;
     let content = |what: &str| GlbError::Content { path: path.into(), what: what.into() };
+    check_corners(file.document.as_json()).map_err(|what| content(&what))?;
+    let document = gltf::Document::from_json(file.document.into_json()).map_err(format)?;
     let blob = file.blob.as_deref().unwrap_or_default();
-    check_extents(&file.document, blob).and_then(|()| check_kinds(&file.document)).map_err(|what| content(&what))?;
-    let (bones, bone_of_node) = bones(&file.document).ok_or_else(|| content("the nodes form a loop"))?;
+    check_extents(&document, blob).and_then(|()| check_kinds(&document)).map_err(|what| content(&what))?;
+    let (bones, bone_of_node) = bones(&document).ok_or_else(|| content("the nodes form a loop"))?;
     if bones.is_empty() || bones.len() > usize::from(u16::MAX) {
         return Err(content("it holds no node, or too many"));
     }
-    if unfolded(&file.document) > UNFOLDED * bytes.len() {
+    if unfolded(&document) > UNFOLDED * bytes.len() {
         return Err(content(TOO_LARGE));
     }
-    let skin = skin(&file.document, blob, bones.len(), &bone_of_node);
+    let skin = skin(&document, blob, bones.len(), &bone_of_node);
     let room = UNFOLDED * bytes.len() + UNFOLDED_FREELY;
-    let motions = motions(&file.document, blob, &bones, &bone_of_node, room).ok_or_else(|| content(TOO_LARGE))?;
+    let motions = motions(&document, blob, &bones, &bone_of_node, room).ok_or_else(|| content(TOO_LARGE))?;
     Ok(Creature { bones, skin, motions })
 }
 

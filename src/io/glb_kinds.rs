@@ -41,6 +41,17 @@ pub(super) fn check_kinds(document: &gltf::Document) -> Result<(), String> {
     Ok(())
 }
 
+/// That what corners of triangles hold is there, which the crate's own checks take for granted.
+pub(super) fn check_corners(root: &gltf::json::Root) -> Result<(), String> {
+    let mut attributes = root.meshes.iter().flat_map(|mesh| &mesh.primitives).flat_map(|primitive| primitive.attributes.values());
+    match attributes.find(|accessor| accessor.value() >= root.accessors.len()) {
+        Some(accessor) => {
+            Err(format!("a mesh asks for accessor {accessor} of {}; the file is damaged, export it again", root.accessors.len()))
+        }
+        None => Ok(()),
+    }
+}
+
 /// What channels move; the crate checks everything else of a file.
 fn check_targets(root: &gltf::json::Root) -> Result<(), String> {
     for (index, animation) in root.animations.iter().enumerate() {
