@@ -1,7 +1,10 @@
 //! The fit on measurements made without pictures, whose truth is a state of the model itself.
 
+mod common;
+
 use std::sync::Arc;
 
+use common::across;
 use muybridge::body::{Joint, NODES, Pose, PosedSurface, Shape, Surface, place};
 use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;
@@ -143,9 +146,7 @@ fn what_people_do_is_found_by_evidence() {
         let (cycle, shape) = (subject.cycle(parameter, 0), subject.shape());
         let length = if activity.is_cyclic() { Length::Seconds(1.2) } else { Length::Cycles(1) };
         let clip = play_cycle(&cycle, &shape.offsets(), 20.0, length);
-        let heading = staging::crossing_heading(&rig);
-        let start = staging::cross_the_view(&rig, &clip, &shape, heading).unwrap();
-        let poses = staging::poses_in_world(&clip, &shape, rig.up, start, heading);
+        let poses = across(&rig, &clip, &shape);
         let seen = staging::longest_run_in_view(&rig, &shape, &poses);
         let frames: Vec<_> = seen.clone().map(|t| (t, t as f64 / 20.0, &poses[t])).collect();
         let observations = observed(&rig, &shape, &frames);

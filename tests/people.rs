@@ -1,14 +1,15 @@
 //! Clouds of a person that the phantom renders: against the known surface, against OpenCV, and under bad light.
 
+mod common;
+
 use std::path::Path;
 
+use common::walk_across;
 use image::GrayImage;
-use muybridge::body::{Placement, Pose, PosedSurface, Shape, place};
+use muybridge::body::{Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudError, CloudOptions, CloudRig, FrameCloud};
 use muybridge::io::calib_toml::read_rig;
-use muybridge::motion::{Length, play_cycle};
-use muybridge::motion_model::{Activity, synthetic};
-use muybridge::phantom::{Scene, Stage, View, depth, distance_to_skin, mask, render, render_stage, staging};
+use muybridge::phantom::{Scene, Stage, View, depth, distance_to_skin, mask, render, render_stage};
 use muybridge::rig::{Lens, Rig};
 use nalgebra::{Matrix3, Vector3};
 use opencv::core::{CV_32F, CV_32FC1, Mat, Point3f, Scalar, Size, Vec3f};
@@ -39,12 +40,7 @@ fn short() -> Rig {
 }
 
 fn film(rig: Rig, seed: u64, noise_grey: f64) -> Take {
-    let subject = synthetic::subject(Activity::Walking, seed);
-    let shape: Shape = subject.shape();
-    let clip = play_cycle(&subject.cycle(1.2, 0), &shape.offsets(), 30.0, Length::Seconds(1.0));
-    let heading = staging::crossing_heading(&rig);
-    let start = staging::cross_the_view(&rig, &clip, &shape, heading).unwrap();
-    let poses = staging::poses_in_world(&clip, &shape, rig.up, start, heading);
+    let (shape, poses) = walk_across(&rig, seed, 1.2, 30.0, 1.0);
     let pose = poses[7 + seed as usize % 7].clone();
     let mut scene = Scene::new(Stage::around(&rig, &[poses[0].root, poses[30].root]), &shape);
     (scene.noise_grey, scene.seed) = (noise_grey, seed);

@@ -3,7 +3,7 @@
 use image::{GrayImage, Luma};
 use nalgebra::Point2;
 
-use crate::math::distance_field::DistanceField;
+use crate::math::distance_field::{DistanceField, extent};
 
 /// Cells of the distance to a silhouette: half the memory of pixels in each direction, a centimetre at 3 m.
 const FIELD_STEP_PX: usize = 2;
@@ -22,13 +22,10 @@ pub struct Silhouette {
 impl Silhouette {
     /// Of a mask of raw pixels, 255 inside.
     pub fn new(mask: &GrayImage) -> Silhouette {
-        let inside = || mask.enumerate_pixels().filter(|(_, _, p)| p.0[0] > 127).map(|(x, y, _)| [x, y]);
-        let around = inside().fold(None, |around: Option<[[u32; 2]; 2]>, p| {
-            let [least, most] = around.unwrap_or([p, p]);
-            Some([[least[0].min(p[0]), least[1].min(p[1])], [most[0].max(p[0]), most[1].max(p[1])]])
-        });
+        let inside = mask.enumerate_pixels().filter(|(_, _, p)| p.0[0] > 127).map(|(x, y, _)| [x as usize, y as usize]);
         let size_px = mask.dimensions().into();
-        let Some([least, most]) = around else { return Silhouette { size_px, ..Silhouette::default() } };
+        let Some(extent) = extent(inside) else { return Silhouette { size_px, ..Silhouette::default() } };
+        let [least, most] = extent.map(|place| place.map(|v| v as u32));
         let kept = image::imageops::crop_imm(mask, least[0], least[1], most[0] - least[0] + 1, most[1] - least[1] + 1).to_image();
         Silhouette { size_px, corner_px: least, kept }
     }

@@ -311,12 +311,15 @@ mod tests {
         }
     }
 
+    /// Of 5 cm, four metres before the cameras.
+    fn ball() -> PosedSurface {
+        let placement = place(&Shape::template(1.7).offsets(), &Pose::rest(Vector3::new(0.0, 4.0, 1.0)));
+        PosedSurface::new(&Surface::ball(Joint::Root, 0.05), &placement)
+    }
+
     #[test]
     fn feet_are_on_the_skin_and_the_distance_is_the_way_there() {
-        let surface = PosedSurface::new(
-            &Surface::ball(Joint::Root, 0.05),
-            &place(&Shape::template(1.7).offsets(), &Pose::rest(Vector3::new(0.0, 4.0, 1.0))),
-        );
+        let surface = ball();
         let centre = surface.primitives[0].centre;
         let along = [Vector3::x(), -Vector3::z(), Vector3::new(1.0, 1.0, -0.5).normalize()];
         let distances = [-0.012, -0.004, 0.004, 0.03, 0.1];
@@ -334,10 +337,7 @@ mod tests {
 
     #[test]
     fn a_noisy_point_comes_from_the_most_probable_of_the_skin_that_is_seen() {
-        let surface = PosedSurface::new(
-            &Surface::ball(Joint::Root, 0.05),
-            &place(&Shape::template(1.7).offsets(), &Pose::rest(Vector3::new(0.0, 4.0, 1.0))),
-        );
+        let surface = ball();
         let centre = surface.primitives[0].centre;
         let sight = (centre - KNOWN.viewpoint).normalize();
         let across = sight.cross(&Vector3::z()).normalize();

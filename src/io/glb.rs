@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::{Matrix4, Quaternion, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
 
-use super::glb_kinds::{check_corners, check_kinds};
+use super::glb_kinds::{check_kinds, check_references};
 use super::glb_tracks::motions;
 use super::write_atomic;
 use crate::animal::creature::{Bone, Creature, Local, Motion, Skin, Vertex};
@@ -47,7 +47,7 @@ pub fn read(path: &Path) -> Result<Creature, GlbError> {
     let format = |e: gltf::Error| GlbError::Format { path: path.into(), why: e.to_string() };
     let file = gltf::Gltf::from_slice_without_validation(&bytes).map_err(format)?;
     let content = |what: &str| GlbError::Content { path: path.into(), what: what.into() };
-    check_corners(file.document.as_json()).map_err(|what| content(&what))?;
+    check_references(file.document.as_json()).map_err(|what| content(&what))?;
     let document = gltf::Document::from_json(file.document.into_json()).map_err(format)?;
     let blob = file.blob.as_deref().unwrap_or_default();
     check_extents(&document, blob).and_then(|()| check_kinds(&document)).map_err(|what| content(&what))?;

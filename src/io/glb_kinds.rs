@@ -16,7 +16,6 @@ type Kinds = (&'static [Dimensions], &'static [DataType]);
 const PARTS: &[DataType] = &[I8, U8, I16, U16, F32];
 
 pub(super) fn check_kinds(document: &gltf::Document) -> Result<(), String> {
-    check_targets(document.as_json())?;
     for primitive in document.meshes().flat_map(|mesh| mesh.primitives().collect::<Vec<_>>()) {
         for (semantic, accessor) in primitive.attributes() {
             check(&accessor, attribute(&semantic), &format!("{semantic:?}").to_lowercase())?;
@@ -41,8 +40,12 @@ pub(super) fn check_kinds(document: &gltf::Document) -> Result<(), String> {
     Ok(())
 }
 
-/// That what corners of triangles hold is there, which the crate's own checks take for granted.
-pub(super) fn check_corners(root: &gltf::json::Root) -> Result<(), String> {
+/// That what meshes and channels refer to is there. The crate's own checks take the first for granted and leave out the second.
+pub(super) fn check_references(root: &gltf::json::Root) -> Result<(), String> {
+    check_corners(root).and_then(|()| check_targets(root))
+}
+
+fn check_corners(root: &gltf::json::Root) -> Result<(), String> {
     let mut attributes = root.meshes.iter().flat_map(|mesh| &mesh.primitives).flat_map(|primitive| primitive.attributes.values());
     match attributes.find(|accessor| accessor.value() >= root.accessors.len()) {
         Some(accessor) => {
@@ -52,7 +55,6 @@ pub(super) fn check_corners(root: &gltf::json::Root) -> Result<(), String> {
     }
 }
 
-/// What channels move; the crate checks everything else of a file.
 fn check_targets(root: &gltf::json::Root) -> Result<(), String> {
     for (index, animation) in root.animations.iter().enumerate() {
         let mut sound = true;

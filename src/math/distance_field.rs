@@ -27,17 +27,11 @@ impl DistanceField {
         let size = [width.div_ceil(step), height.div_ceil(step)];
         let set: Vec<bool> =
             (0..size[0] * size[1]).map(|i| inside((i % size[0] * step).min(width - 1), (i / size[0] * step).min(height - 1))).collect();
-        let rows = || set.chunks_exact(size[0].max(1));
-        let beginning = |row: &[bool]| row.iter().position(|s| *s);
-        let around = |least: Option<usize>, most: Option<usize>, k: usize| {
-            let first = least?.saturating_sub(MARGIN);
-            Some((first, (most? + MARGIN + 1).min(size[k]) - first))
-        };
-        let across = around(rows().filter_map(beginning).min(), rows().filter_map(|row| row.iter().rposition(|s| *s)).max(), 0);
-        let down = around(rows().position(|row| row.contains(&true)), rows().rposition(|row| row.contains(&true)), 1);
-        let Some(((left, w), (top, h))) = across.zip(down) else {
+        let Some([least, most]) = extent((0..set.len()).filter(|i| set[*i]).map(|i| [i % size[0], i / size[0]])) else {
             return DistanceField { size, first: [0; 2], kept: [0; 2], step: step as f64, values: Vec::new() };
         };
+        let [left, top] = least.map(|v| v.saturating_sub(MARGIN));
+        let (w, h) = ((most[0] + MARGIN + 1).min(size[0]) - left, (most[1] + MARGIN + 1).min(size[1]) - top);
         // Within a column the distance to the nearest set cell, infinite without one.
         let of_cell = |i: usize| if set[(top + i / w) * size[0] + left + i % w] { 0.0 } else { f64::INFINITY };
         let mut columns: Vec<f64> = (0..w * h).map(of_cell).collect();
@@ -87,6 +81,12 @@ impl DistanceField {
         let across = (q - p) * (1.0 - b) + (s - r) * b;
         (top * (1.0 - b) + bottom * b, [across / self.step, (bottom - top) / self.step])
     }
+}
+
+/// The least and the largest coordinates of places; `None` without any.
+pub fn extent(mut places: impl Iterator<Item = [usize; 2]>) -> Option<[[usize; 2]; 2]> {
+    let first = places.next()?;
+    Some(places.fold([first; 2], |[least, most], p| [[0, 1].map(|k| least[k].min(p[k])), [0, 1].map(|k| most[k].max(p[k]))]))
 }
 
 /// min over q of f(q)² + (p − q)² for every p: the lower envelope of parabolas, those with infinite f left out. `scratch` takes

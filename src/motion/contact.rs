@@ -86,7 +86,7 @@ impl FootTrack {
         let mut first: [Option<Vector3<f64>>; 3] = [None; 3];
         let mut largest: f64 = 0.0;
         for sole in &self.soles[contact] {
-            let lowest = lowest_m(sole);
+            let lowest = lowest_m(&heights_m(sole));
             for (first, p) in first.iter_mut().zip(sole) {
                 *first = (p.y < lowest + TOUCHES_M).then(|| first.unwrap_or(*p));
                 largest = largest.max(first.map_or(0.0, |f| (p - f).xz().norm()));
@@ -102,7 +102,7 @@ impl FootTrack {
             return Vec::new();
         }
         let stands = |frame: usize| {
-            let lowest = lowest_m(&self.soles[frame]);
+            let lowest = lowest_m(&heights_m(&self.soles[frame]));
             let speed = self.slide(frame.min(frames - 2)).xz().norm() * clip.fps;
             lowest < NEAR * clip.hip_height_m && speed < slow_m_s(clip, frame)
         };
@@ -110,14 +110,18 @@ impl FootTrack {
     }
 }
 
+fn heights_m(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
+    sole.map(|p| p.y)
+}
+
 /// Height of the lowest point of a sole; the floor's if it is under that.
-pub fn lowest_m(sole: &[Vector3<f64>; 3]) -> f64 {
-    sole.iter().map(|p| p.y.max(0.0)).fold(f64::INFINITY, f64::min)
+pub fn lowest_m(heights_m: &[f64; 3]) -> f64 {
+    heights_m.iter().map(|y| y.max(0.0)).fold(f64::INFINITY, f64::min)
 }
 
 /// Weights w_i of the points of a sole.
 fn weights(sole: &[Vector3<f64>; 3]) -> [f64; 3] {
-    let lowest = lowest_m(sole);
+    let lowest = lowest_m(&heights_m(sole));
     let raw = sole.map(|p| (-(p.y.max(0.0) - lowest) / TOUCH_M).exp());
     let sum: f64 = raw.iter().sum();
     raw.map(|w| w / sum)

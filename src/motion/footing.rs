@@ -16,7 +16,7 @@ use std::ops::Range;
 
 use nalgebra::{DVector, SMatrix, Vector3};
 
-use super::contact::FootTrack;
+use super::contact::{FootTrack, lowest_m};
 use crate::body::{Clip, Joint, Pose, place};
 use crate::math::arrow::{ArrowProblem, NormalEquations};
 use crate::math::rotation::{exp, hat, left_jacobian};
@@ -120,9 +120,8 @@ fn pressed(height_m: f64) -> f64 {
 
 /// w_i of a sole from the heights that its points are to have; 1 for the lowest.
 fn touching(heights: &[f64; 3]) -> [f64; 3] {
-    let over = heights.map(|y| y.max(0.0));
-    let lowest = over.into_iter().fold(f64::INFINITY, f64::min);
-    over.map(|y| bump((y - lowest) / TOUCH_M))
+    let lowest = lowest_m(heights);
+    heights.map(|y| bump((y.max(0.0) - lowest) / TOUCH_M))
 }
 
 fn vector(x: &[f64]) -> Vector3<f64> {

@@ -6,7 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
-use muybridge::body::{Pose, Shape};
+use muybridge::body::{Clip, Pose, Shape};
 use muybridge::io::manifest::{Entry, find_motions};
 use muybridge::io::{calib_toml, read_clip};
 use muybridge::motion::{Length, play_cycle};
@@ -24,9 +24,12 @@ pub fn mocap(folder: &str) -> Option<PathBuf> {
     path.exists().then_some(path)
 }
 
-/// The cycles of one recording, named after its file; none where it is no motion or cannot be cut.
+/// The cycles of one recording, named after its file; none where it is a pose of one frame or cannot be cut.
 pub fn cut(entry: &Entry, activity: Activity) -> Vec<Cycle> {
-    let Ok(read) = read_clip(&entry.path) else { return Vec::new() };
+    let read = match read_clip(&entry.path) {
+        Err(error) if error.to_string().contains("one frame is no motion") => return Vec::new(),
+        read => read.unwrap(),
+    };
     let label = Label {
         subject: entry.subject.clone(),
         source: entry.path.file_stem().unwrap().to_string_lossy().into_owned(),
@@ -58,10 +61,15 @@ pub fn walk_across(rig: &Rig, person: u64, speed_m_s: f64, fps: f64, seconds: f6
     let subject = synthetic::subject(Activity::Walking, person);
     let shape = subject.shape();
     let clip = play_cycle(&subject.cycle(speed_m_s, 0), &shape.offsets(), fps, Length::Seconds(seconds));
-    let heading = staging::crossing_heading(rig);
-    let start = staging::cross_the_view(rig, &clip, &shape, heading).unwrap();
-    let poses = staging::poses_in_world(&clip, &shape, rig.up, start, heading);
+    let poses = across(rig, &clip, &shape);
     (shape, poses)
+}
+
+/// The poses of a motion across the view of a rig, in the rig's world.
+pub fn across(rig: &Rig, clip: &Clip, shape: &Shape) -> Vec<Pose> {
+    let heading = staging::crossing_heading(rig);
+    let start = staging::cross_the_view(rig, clip, shape, heading).unwrap();
+    staging::poses_in_world(clip, shape, rig.up, start, heading)
 }
 
 /// Runs the program: whether it succeeded, what it said, what it complained of.

@@ -92,7 +92,8 @@ fn write_page(study: &Study, statuses: &[Status]) -> Result<()> {
     write_atomic(&path, report::study::html(&page).as_bytes()).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Writes index.html and, when all else is in place, summary.csv of all sessions; prints counts and failures; an error where a chosen session failed or is not done.
+/// Writes index.html and, when all else is in place, summary.csv of all sessions; prints counts and failures. An error where a
+/// chosen session failed or is not done.
 pub fn summarise(study: &Study, all: &[StudySession], chosen: &[StudySession]) -> Result<()> {
     let mut statuses: Vec<Status> = all.iter().map(|s| study.status(s)).collect();
     write_page(study, &statuses)?;
