@@ -136,6 +136,7 @@ pub const SETTINGS: Settings = Settings {
     arm_length: 0.04,
     width: 0.2,
     posture: 0.04,
+    wrist: 0.1,
     deviation: 0.1,
     turn_acceleration: 40.0,
 };

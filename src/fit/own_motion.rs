@@ -92,7 +92,7 @@ mod tests {
     use super::*;
     use crate::body::Shape;
     use crate::fit::curve::{Curve, tests::made_up_model};
-    use crate::fit::state::{Carrier, State, Turns};
+    use crate::fit::state::{Carrier, Posture, State, Turns};
     use crate::math::rotation::exp;
     use crate::motion_model::{Activity, SAMPLES};
 
@@ -112,7 +112,7 @@ mod tests {
             |c: &Carrier| -> Turns { std::array::from_fn(|k| if DEVIATING[k] == Joint::LKnee { knee(c.phase) } else { Vector3::zeros() }) };
         let deviations = carriers.iter().map(turns).collect();
         let weights = vec![1.0, -0.5, 0.3];
-        let state = State { carriers, weights, shape, posture: Turns::default(), deviations };
+        let state = State { carriers, weights, shape, posture: Posture::default(), deviations };
         let poses = (0..100).map(|t| state.pose(&curve, t)).collect();
         Fit {
             state,

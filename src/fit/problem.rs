@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::curve::Curve;
-use super::state::{LOCAL, Layout, Motion, State};
+use super::state::{HELD, LOCAL, Layout, Motion, State};
 use super::weighing::{Fitness, Frozen, FrozenOutside, PointResidual, freeze, freeze_outsides, outside_px};
 use super::wrench::{FrameNormal, Gathered, Gradient, Pull};
 use crate::body::surface::{Evaluation, SKIN};
@@ -83,11 +83,19 @@ pub struct Settings {
     pub length: f64,
     pub arm_length: f64,
     pub width: f64,
-    /// Constant turn of a joint against the model, rad.
+    /// Constant turn of a joint against the model, rad, and of a wrist, which marker sets hold least alike.
     pub posture: f64,
+    pub wrist: f64,
     /// Turn of a joint against the model in one frame, rad, and its acceleration, rad/s².
     pub deviation: f64,
     pub turn_acceleration: f64,
+}
+
+impl Settings {
+    /// Standard deviation of a joint's posture, rad.
+    pub fn posture_of(&self, joint: Joint) -> f64 {
+        if matches!(joint, Joint::LWrist | Joint::RWrist) { self.wrist } else { self.posture }
+    }
 }
 
 /// What is known before the fit.
@@ -341,7 +349,10 @@ impl<'a> Problem<'a> {
             priors.push((layout.weights + 1 + Length::COUNT + i, (state.shape.widths[i] - 1.0) / s.width, 1.0 / s.width));
         }
         let turns = state.posture.iter().flat_map(|turn| turn.iter()).enumerate();
-        priors.extend(turns.map(|(k, turn)| (layout.posture(0) + k, turn / s.posture, 1.0 / s.posture)));
+        priors.extend(turns.map(|(k, turn)| {
+            let sigma = s.posture_of(HELD[k / 3]);
+            (layout.posture(0) + k, turn / sigma, 1.0 / sigma)
+        }));
         priors
     }
 
@@ -530,6 +541,7 @@ pub(super) mod tests {
         arm_length: 0.06,
         width: 0.1,
         posture: 0.1,
+        wrist: 0.2,
         deviation: 0.1,
         turn_acceleration: 5.0,
     };
@@ -546,9 +558,10 @@ pub(super) mod tests {
             world_from_carrier: exp(&Vector3::new(1.5, 0.1 * t as f64, 0.2 + 0.03 * (t * t) as f64)),
             phase: 0.21 + 0.033 * t as f64 + 0.004 * (t * t) as f64,
         });
-        let turns = |a: f64| std::array::from_fn(|k| 0.1 * Vector3::new((a + k as f64).sin(), (a * k as f64).cos(), a.cos()));
-        let deviations = (0..3).map(|t| turns(1.0 + t as f64)).collect();
-        State { carriers: carriers.collect(), weights: vec![2.0, -1.5, 0.7], shape, posture: turns(0.3), deviations }
+        let turn = |a: f64, k: usize| 0.1 * Vector3::new((a + k as f64).sin(), (a * k as f64).cos(), a.cos());
+        let deviations = (0..3).map(|t| std::array::from_fn(|k| turn(1.0 + t as f64, k))).collect();
+        let posture = std::array::from_fn(|k| turn(0.3, k));
+        State { carriers: carriers.collect(), weights: vec![2.0, -1.5, 0.7], shape, posture, deviations }
     }
 
     /// Points around the skin and rays past it.

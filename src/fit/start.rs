@@ -13,7 +13,7 @@ use super::FitError;
 use super::curve::Curve;
 use super::people::Person;
 use super::problem::{Frame, Known, Settings};
-use super::state::{Carrier, State, Turns};
+use super::state::{Carrier, Posture, State};
 use super::weighing::{fitness, total};
 use crate::body::Shape;
 use crate::math::order::quantile;
@@ -198,7 +198,7 @@ fn state_of(track: &Track, frames: &[Frame], curve: &Curve, heading: &Vector3<f6
         carriers: carriers.collect(),
         weights: vec![0.0; curve.components()],
         shape: Shape::template(track.stature_m),
-        posture: Turns::default(),
+        posture: Posture::default(),
         deviations: Vec::new(),
     }
 }

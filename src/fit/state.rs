@@ -20,8 +20,9 @@ use crate::math::rotation::{exp, left_jacobian, log};
 /// Unknowns of one frame without deviations.
 pub const LOCAL: usize = 7;
 
-/// Joints that may leave the model; those between follow it.
-pub const DEVIATING: [Joint; 11] = [
+/// Joints that may be held otherwise than in the model; those between follow it. Wrists last: how they are held can be seen, how
+/// they turn from frame to frame hardly.
+pub const HELD: [Joint; 13] = [
     Joint::LHip,
     Joint::LKnee,
     Joint::LAnkle,
@@ -33,10 +34,17 @@ pub const DEVIATING: [Joint; 11] = [
     Joint::LElbow,
     Joint::RShoulder,
     Joint::RElbow,
+    Joint::LWrist,
+    Joint::RWrist,
 ];
+
+/// Those of them, the first, that may leave the model from frame to frame.
+pub const DEVIATING: [Joint; 11] = *HELD.first_chunk().unwrap();
 
 /// Turns of the [`DEVIATING`] joints, rad, in the joint's own frame.
 pub type Turns = [Vector3<f64>; DEVIATING.len()];
+/// Turns of the [`HELD`] joints, likewise.
+pub type Posture = [Vector3<f64>; HELD.len()];
 
 /// The gliding frame of one instant, and the phase.
 #[derive(Clone, Debug, PartialEq)]
@@ -57,7 +65,7 @@ pub struct State {
     pub weights: Vec<f64>,
     pub shape: Shape,
     /// What the person's joints keep to all the time against the model.
-    pub posture: Turns,
+    pub posture: Posture,
     /// Per frame, or empty: the person moves exactly as the model.
     pub deviations: Vec<Turns>,
 }
@@ -87,13 +95,13 @@ impl Layout {
     pub fn width(self, limb: Length) -> usize {
         self.weights + 1 + Length::COUNT + limb as usize
     }
-    /// Posture of deviating joint `k`, first of three.
+    /// Posture of held joint `k`, first of three.
     pub fn posture(self, k: usize) -> usize {
         self.weights + SIZES + 3 * k
     }
     /// Length of z.
     pub fn shared(self) -> usize {
-        self.weights + SIZES + 3 * DEVIATING.len()
+        self.weights + SIZES + 3 * HELD.len()
     }
     /// Unknowns that move one frame.
     pub fn size(self) -> usize {
@@ -147,9 +155,11 @@ impl State {
     }
 
     /// Posture and deviation of the joints in one frame together.
-    fn turns(&self, frame: usize) -> Turns {
-        let deviation = self.deviations.get(frame);
-        std::array::from_fn(|k| self.posture[k] + deviation.map_or(Vector3::zeros(), |d| d[k]))
+    fn turns(&self, frame: usize) -> Posture {
+        let mut turns = self.posture;
+        let deviation = self.deviations.get(frame).into_iter().flatten();
+        turns.iter_mut().zip(deviation).for_each(|(turn, deviation)| *turn += deviation);
+        turns
     }
 
     /// The pose of one frame, equation (1).
@@ -161,7 +171,7 @@ impl State {
         let carrier = &self.carriers[frame];
         let mut joints: [UnitQuaternion<f64>; BALL_JOINTS] =
             std::array::from_fn(|k| curve.mean_rotations[k] * exp(&CurveSample::joint(value, k)));
-        for (joint, turn) in DEVIATING.iter().zip(self.turns(frame)) {
+        for (joint, turn) in HELD.iter().zip(self.turns(frame)) {
             joints[*joint as usize - 1] *= exp(&turn);
         }
         let ride = CurveSample::root_position(value) * self.shape.hip_height_m();
@@ -196,11 +206,11 @@ impl State {
             let world_from_mean = (world_from_parent * curve.mean_rotations[k - 1]).to_rotation_matrix().into_inner();
             let coordinates = CurveSample::joint(value, k - 1);
             add_spin(&mut twist, layout, &sample, &(world_from_mean * left_jacobian(&coordinates)), &at, k - 1);
-            if let Some(which) = DEVIATING.iter().position(|d| *d == joint) {
+            if let Some(which) = HELD.iter().position(|d| *d == joint) {
                 let spin = world_from_mean * exp(&coordinates).to_rotation_matrix().into_inner() * left_jacobian(&turns[which]);
                 for (axis, omega) in spin.column_iter().map(|c| c.into_owned()).enumerate() {
                     twist.add_turn(layout.local + layout.posture(which) + axis, &omega, &at);
-                    if layout.local > LOCAL {
+                    if layout.local > LOCAL && which < DEVIATING.len() {
                         twist.add_turn(layout.deviation(which) + axis, &omega, &at);
                     }
                 }
@@ -319,7 +329,7 @@ mod tests {
         };
         let carriers = times_s.iter().map(carrier).collect();
         let shape = Shape::template(1.7);
-        let all = State { carriers, weights: vec![1.0], shape, posture: Turns::default(), deviations: Vec::new() };
+        let all = State { carriers, weights: vec![1.0], shape, posture: Posture::default(), deviations: Vec::new() };
         let some = [0, 2, 5];
         let back = all.at(&some).between(&some, &times_s);
         assert_eq!(back.carriers.len(), all.carriers.len());

@@ -9,7 +9,7 @@ use nalgebra::{DVector, UnitQuaternion, Vector3};
 
 use super::Fit;
 use super::curve::CurveSample;
-use super::state::{Carrier, DEVIATING, State};
+use super::state::{Carrier, HELD, State};
 use crate::body::{Clip, Pose};
 use crate::math::rotation::exp;
 use crate::motion_model::gait::{LEGS, PERCENTS, flexion};
@@ -55,7 +55,7 @@ pub fn leg_angles(fit: &Fit, foot: usize, strike: f64) -> LegAngles {
 /// Equation (1) at one phase.
 fn angle(fit: &Fit, sample: &CurveSample, foot: usize, j: usize) -> (f64, f64) {
     let node = LEGS[foot][j] as usize - 1;
-    let posture = DEVIATING.iter().position(|d| *d == LEGS[foot][j]);
+    let posture = HELD.iter().position(|d| *d == LEGS[foot][j]);
     let v = CurveSample::joint(sample.value.as_slice(), node);
     let c = posture.map_or(Vector3::zeros(), |k| fit.state.posture[k]);
     let of = |v: Vector3<f64>, c: Vector3<f64>| flexion(&(fit.curve.mean_rotations[node] * exp(&v) * exp(&c)), j);

@@ -1,6 +1,6 @@
 //! The state of a fit between two iterations, kept on disk exactly, so that a fit that was stopped goes on with the same numbers.
 //!
-//! One file per stage of the fit, little endian: `MBFIT001`; rounds and iterations (u64), cost of the round before (f64);
+//! One file per stage of the fit, little endian: `MBFIT002`; rounds and iterations (u64), cost of the round before (f64);
 //! stature, lengths, widths, posture; number of weights (u64) and weights; number of frames (u64) and per frame position,
 //! rotation (x y z w), phase; number of deviations (u64) and deviations (all f64); BLAKE3 of all before it.
 
@@ -11,9 +11,9 @@ use nalgebra::{Quaternion, Unit, Vector3};
 use super::write_atomic;
 use crate::body::Shape;
 use crate::fit::Checkpoint;
-use crate::fit::state::{Carrier, State, Turns};
+use crate::fit::state::{Carrier, State};
 
-const MAGIC: &[u8; 8] = b"MBFIT001";
+const MAGIC: &[u8; 8] = b"MBFIT002";
 
 fn path(folder: &Path, stage: usize) -> PathBuf {
     folder.join(format!("{stage:02}.fit"))
@@ -66,7 +66,7 @@ fn put(bytes: &mut Vec<u8>, values: &[f64]) {
     bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
 }
 
-fn put_turns(bytes: &mut Vec<u8>, turns: &Turns) {
+fn put_turns(bytes: &mut Vec<u8>, turns: &[Vector3<f64>]) {
     turns.iter().for_each(|turn| put(bytes, turn.as_slice()));
 }
 
@@ -84,8 +84,8 @@ fn take<const N: usize>(rest: &mut &[u8]) -> Option<[f64; N]> {
     Some(values)
 }
 
-fn take_turns(rest: &mut &[u8]) -> Option<Turns> {
-    let mut turns = Turns::default();
+fn take_turns<const N: usize>(rest: &mut &[u8]) -> Option<[Vector3<f64>; N]> {
+    let mut turns = [Vector3::zeros(); N];
     for turn in &mut turns {
         *turn = Vector3::from(take::<3>(rest)?);
     }
@@ -119,8 +119,8 @@ mod tests {
             carriers: (0..5).map(carrier).collect(),
             weights: vec![0.1, -1.0 / 7.0],
             shape,
-            posture: turns(2),
-            deviations: (0..5).map(turns).collect(),
+            posture: std::array::from_fn(third),
+            deviations: (1..6).map(turns).collect(),
         };
         Checkpoint { rounds: 3, iterations: 4, cost: 1e3 / 3.0, state }
     }

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::write_atomic;
 use crate::body::Length;
-use crate::fit::state::{DEVIATING, LOCAL};
+use crate::fit::state::{HELD, LOCAL};
 use crate::fit::{Fit, Observation, weighing::total};
 use crate::motion_model::Activity;
 
@@ -107,7 +107,7 @@ pub fn write(path: &Path, fit: &Fit, observations: &[Observation], models: &[Mod
         information_per_point: fit.uncertainty.as_ref().map(|u| u.shares[0]),
         information_per_ray: fit.uncertainty.as_ref().map(|u| u.shares[1]),
         leaves_model: !fit.state.deviations.is_empty(),
-        posture_deg: DEVIATING.iter().zip(&fit.state.posture).map(|(j, turn)| (j.name(), (*turn).map(f64::to_degrees).into())).collect(),
+        posture_deg: HELD.iter().zip(&fit.state.posture).map(|(j, turn)| (j.name(), (*turn).map(f64::to_degrees).into())).collect(),
         speed_m_s: fit.speed_m_s,
         cadence_hz: fit.cadence_hz,
         hip_height_m: shape.hip_height_m(),

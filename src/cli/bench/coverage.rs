@@ -9,7 +9,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use muybridge::body::{Joint, Length, Pose, Shape, Surface, place};
 use muybridge::fit::curve::Curve;
-use muybridge::fit::state::{Carrier, DEVIATING, State, Turns};
+use muybridge::fit::state::{Carrier, DEVIATING, HELD, Posture, State, Turns};
 use muybridge::fit::{Fit, FitOptions, SETTINGS};
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, Model};
@@ -144,11 +144,13 @@ impl Person {
             }
         };
         let carriers = (0..FRAMES).map(carrier).collect();
-        let mut state = State { carriers, weights, shape, posture: Turns::default(), deviations: Vec::new() };
+        let mut state = State { carriers, weights, shape, posture: Posture::default(), deviations: Vec::new() };
         if !gliding {
+            for (turn, joint) in state.posture.iter_mut().zip(HELD) {
+                turn.iter_mut().for_each(|angle| *angle = SETTINGS.posture_of(joint) * normal(&mut rng));
+            }
             state.deviations = vec![Turns::default(); FRAMES];
             for (joint, axis) in (0..DEVIATING.len()).flat_map(|joint| (0..3).map(move |axis| (joint, axis))) {
-                state.posture[joint][axis] = SETTINGS.posture * normal(&mut rng);
                 let turns = deviation(&mut rng);
                 state.deviations.iter_mut().zip(turns.iter()).for_each(|(of_frame, turn)| of_frame[joint][axis] = *turn);
             }
