@@ -14,8 +14,8 @@ use nalgebra::Vector3;
 use re_chunk::Chunk;
 use re_log_encoding::DecoderApp;
 use re_log_types::LogMsg;
-use re_types::archetypes::{EncodedImage, LineStrips3D, Scalars};
-use re_types::components::{Blob, LineStrip3D, Scalar};
+use re_types::archetypes::{EncodedImage, LineStrips3D, RecordingInfo, Scalars};
+use re_types::components::{Blob, LineStrip3D, Name, Scalar};
 
 const FRAMES: usize = 6;
 
@@ -73,6 +73,7 @@ fn a_track_is_recorded_whole_and_the_same_every_time() {
         ["phase", "root_x_m", "root_y_m", "root_z_m", "speed_m_s", "rms_mm"].map(|name| format!("/curves/{name}")).into();
     expected.extend(["", "/cloud", "/body", "/skeleton"].map(|name| format!("/world{name}")));
     expected.extend(rig.cameras.iter().flat_map(|c| ["", "/picture"].map(|part| format!("/world/cameras/{}{part}", c.name))));
+    expected.push("/__properties".into());
     expected.sort();
     assert_eq!(found.keys().cloned().collect::<Vec<_>>(), expected);
     for (entity, chunks) in &found {
@@ -83,9 +84,12 @@ fn a_track_is_recorded_whole_and_the_same_every_time() {
             assert_eq!(timelines, ["frame", "time"], "{entity}");
         }
         let rows: usize = moving.iter().map(|chunk| chunk.num_rows()).sum();
-        let still = entity == "/world" || entity.starts_with("/world/cameras") && !entity.ends_with("/picture");
+        let still = ["/world", "/__properties"].contains(&entity.as_str()) || entity.starts_with("/world/cameras") && !entity.ends_with("/picture");
         assert_eq!(rows, if still { 0 } else { FRAMES }, "{entity}");
     }
+
+    let mut names = found["/__properties"][0].iter_component::<Name>(RecordingInfo::descriptor_name().component);
+    assert_eq!(names.next().unwrap().as_slice()[0].as_str(), "session");
 
     // Bones end where joints.csv has them.
     let joints = joints_csv::read(Path::new(&at("out1/joints.csv"))).unwrap();

@@ -37,24 +37,24 @@ pub fn observe(
     while !batch.is_empty() {
         let of_frame = |frame: &FrameSet| {
             interrupt::check()?;
-            let cloud = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
+            let found = found(frame, rig, options, kept).with_context(|| format!("frame {}", frame.number));
             bar.inc(1);
-            cloud
+            found.map(|cloud| (Arc::new(silhouettes(&cloud)), cloud))
         };
         // The next pictures are read meanwhile.
-        let (next, clouds) = rayon::join(&mut read, || batch.par_iter().map(of_frame).collect::<Vec<Result<FrameCloud>>>());
+        let (next, clouds) = rayon::join(&mut read, || batch.par_iter().map(of_frame).collect::<Vec<Result<_>>>());
         for (frame, cloud) in batch.iter().zip(clouds) {
-            let cloud = match cloud {
+            let (silhouettes, cloud) = match cloud {
                 Err(error) if matches!(error.downcast_ref::<CloudError>(), Some(CloudError::Blank { .. })) => {
                     blank.push(error);
-                    FrameCloud::unseen(session.rig.cameras.len())
+                    let unseen = FrameCloud::unseen(session.rig.cameras.len());
+                    (Arc::new(silhouettes(&unseen)), unseen)
                 }
-                cloud => cloud?,
+                found => found?,
             };
             each(frame, &cloud)?;
             let (number, time_s) = (frame.number, frame.time_s);
-            let silhouettes = cloud.masks.iter().map(|mask| mask.as_ref().map(Silhouette::new)).collect();
-            observations.push(Observation { number, time_s, cloud: cloud.cloud, silhouettes: Arc::new(silhouettes) });
+            observations.push(Observation { number, time_s, cloud: cloud.cloud, silhouettes });
         }
         batch = next?;
     }
@@ -73,6 +73,10 @@ pub fn observe(
         );
     }
     Ok(observations)
+}
+
+fn silhouettes(cloud: &FrameCloud) -> Vec<Option<Silhouette>> {
+    cloud.masks.iter().map(|mask| mask.as_ref().map(Silhouette::new)).collect()
 }
 
 /// What stereo finds in one frame, or found before.

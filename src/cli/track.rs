@@ -20,6 +20,7 @@ use muybridge::report::{self, track::UNDECIDED, walk::BAND};
 use muybridge::rig::{Rig, Up};
 use muybridge::style::Style;
 use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 
 use super::motions::{ActivityName, file_name};
 use super::outputs::{Names, Writer};
@@ -84,7 +85,7 @@ impl NamedModel {
 
     /// All embedded models.
     pub fn embedded() -> Result<Vec<NamedModel>> {
-        Activity::ALL.into_iter().map(NamedModel::synthetic).collect()
+        Activity::ALL.into_par_iter().map(NamedModel::synthetic).collect()
     }
 
     /// The models of a session's options.

@@ -168,7 +168,8 @@ impl Session {
                 read_sized(path, camera)
             }
         };
-        let images = self.rig.cameras.iter().zip(&self.cameras).map(read).collect::<Result<_, _>>()?;
+        let images: Vec<Result<_, _>> = self.rig.cameras.par_iter().zip(&self.cameras).map(read).collect();
+        let images = images.into_iter().collect::<Result<_, _>>()?;
         Ok(self.frame_set(index, images))
     }
 
@@ -431,7 +432,8 @@ fn read_backgrounds(folder: &Path, entries: &[PathBuf], rig: &Rig) -> Result<Opt
         Some(path) => read_sized(path, camera),
         None => Err(SessionError::SomeBackgrounds { folder: folder.into(), present: present.join(", "), absent: camera.name.clone() }),
     };
-    found.iter().map(read).collect::<Result<_, _>>().map(Some)
+    let images: Vec<Result<_, _>> = found.par_iter().map(read).collect();
+    images.into_iter().collect::<Result<_, _>>().map(Some)
 }
 
 fn read_sized(path: &Path, camera: &Camera) -> Result<GrayImage, SessionError> {

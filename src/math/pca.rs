@@ -14,7 +14,7 @@ const NULL_SPACE: f64 = 1e-12;
 pub struct Pca {
     /// Length D.
     pub mean: DVector<f64>,
-    /// Orthonormal columns Θ_i, D×m, those with a λ above rounding.
+    /// Orthonormal columns Θ_i, D×m, of those with a λ above rounding as many as were asked for.
     pub basis: DMatrix<f64>,
     /// λ_i of all min(M−1, D) components, largest first, none negative.
     pub eigenvalues: Vec<f64>,
@@ -22,6 +22,15 @@ pub struct Pca {
 
 /// PCA of the columns of `examples` (D×M). Without columns everything is empty.
 pub fn pca(examples: &DMatrix<f64>) -> Pca {
+    with(examples, |eigenvalues| eigenvalues.len())
+}
+
+/// The same with no more of the leading components than hold `part` (0 to 1) of the variance.
+pub fn leading(examples: &DMatrix<f64>, part: f64) -> Pca {
+    with(examples, |eigenvalues| components(eigenvalues, part))
+}
+
+fn with(examples: &DMatrix<f64>, count: impl Fn(&[f64]) -> usize) -> Pca {
     let (d, m) = examples.shape();
     if m == 0 {
         return Pca { mean: DVector::zeros(d), basis: DMatrix::zeros(d, 0), eigenvalues: Vec::new() };
@@ -35,7 +44,8 @@ pub fn pca(examples: &DMatrix<f64>) -> Pca {
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
     order.truncate((m - 1).min(d));
     let eigenvalues: Vec<f64> = order.iter().map(|&i| eigen.eigenvalues[i].max(0.0)).collect();
-    let kept = eigenvalues.iter().take_while(|&&l| l > NULL_SPACE * eigenvalues[0]).count();
+    let real = eigenvalues.iter().take_while(|&&l| l > NULL_SPACE * eigenvalues[0]).count();
+    let kept = real.min(count(&eigenvalues));
     let mut basis = &centred * eigen.eigenvectors.select_columns(&order[..kept]);
     for mut component in basis.column_iter_mut() {
         let sign = if component[component.iamax()] < 0.0 { -1.0 } else { 1.0 };
@@ -97,6 +107,16 @@ mod tests {
     fn counts_components_of_a_part_of_the_variance() {
         let l = [6.0, 3.0, 1.0];
         assert_eq!([0.0, 0.6, 0.61, 0.9, 1.0].map(|p| components(&l, p)), [0, 1, 2, 2, 3]);
+    }
+
+    #[test]
+    fn leading_components_are_the_first_of_all() {
+        let x = examples(40, 9);
+        let (all, some) = (pca(&x), leading(&x, 0.9));
+        let count = components(&all.eigenvalues, 0.9);
+        assert!(count > 1 && count < all.basis.ncols());
+        assert_eq!((&some.eigenvalues, &some.mean), (&all.eigenvalues, &all.mean));
+        assert_eq!(some.basis, all.basis.columns(0, count).into_owned());
     }
 
     #[test]

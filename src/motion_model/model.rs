@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::cadence::CadenceLaw;
 use super::cycle::{Activity, Cycle, ROOT_CHANNELS, RootSample, SAMPLES, neighbours};
 use crate::body::{BALL_JOINTS, DOF};
-use crate::math::pca::{self, Pca, pca};
+use crate::math::pca::{self, Pca};
 use crate::math::rotation::{exp, log, mean};
 
 /// Part of the variance that the stored basis holds.
@@ -94,7 +94,7 @@ impl Model {
     pub fn build(activity: Activity, synthetic: bool, cycles: &[Cycle]) -> Result<Model, ModelError> {
         check(activity, cycles)?;
         let mean_rotations = mean_rotations(cycles);
-        let members: Vec<Member> = cycles.iter().map(|c| member(&mean_rotations, c)).collect();
+        let members: Vec<Member> = cycles.par_iter().map(|c| member(&mean_rotations, c)).collect();
         Model::from_members(activity, synthetic, mean_rotations, members)
     }
 
@@ -109,19 +109,17 @@ impl Model {
             return Err(ModelError::TooFew(members.len()));
         }
         let vectors = DMatrix::from_columns(&members.iter().map(|m| m.vector.clone()).collect::<Vec<_>>());
-        let found = pca(&vectors);
-        let kept = pca::components(&found.eigenvalues, STORED_VARIANCE).min(found.basis.ncols());
-        if kept == 0 {
+        let Pca { mean, basis, eigenvalues } = pca::leading(&vectors, STORED_VARIANCE);
+        if basis.is_empty() {
             return Err(ModelError::NoVariance);
         }
-        let basis = found.basis.columns(0, kept).into_owned();
         let roots = DMatrix::from_columns(&members.iter().map(|m| m.root.clone()).collect::<Vec<_>>());
         let root_mean = roots.column_mean();
-        let mut weights = basis.tr_mul(&vectors);
-        let mean_weights = basis.tr_mul(&found.mean);
+        // A product with a transposed copy runs in blocks, `tr_mul` does not.
+        let mut weights = basis.transpose() * &vectors;
+        let mean_weights = basis.tr_mul(&mean);
         weights.column_iter_mut().for_each(|mut w| w -= &mean_weights);
         let root_basis = root_loadings(&roots, &root_mean, &weights);
-        let Pca { mean, eigenvalues, .. } = found;
         Ok(Model { activity, synthetic, mean_rotations, mean, basis, eigenvalues, root_mean, root_basis, members })
     }
 
@@ -413,7 +411,7 @@ mod tests {
     fn all_components_give_a_member_back() {
         let model = model();
         let vectors: Vec<_> = model.members.iter().map(|m| m.vector.clone()).collect();
-        let full = pca(&DMatrix::from_columns(&vectors));
+        let full = pca::pca(&DMatrix::from_columns(&vectors));
         for member in &model.members {
             let alpha = full.basis.tr_mul(&(&member.vector - &full.mean));
             assert!((&full.mean + &full.basis * alpha - &member.vector).norm() < 1e-9);

@@ -12,7 +12,9 @@ use re_log_encoding::{EncodeError, Encoder};
 use re_log_types::external::re_tuid::Tuid;
 use re_log_types::{EntityPathPart, LogMsg, SetStoreInfo, StoreId, StoreInfo, StoreSource};
 use re_types::AsComponents;
-use re_types::archetypes::{Ellipsoids3D, EncodedImage, LineStrips3D, Pinhole, Points3D, Scalars, Transform3D, ViewCoordinates};
+use re_types::archetypes::{
+    Ellipsoids3D, EncodedImage, LineStrips3D, Pinhole, Points3D, RecordingInfo, Scalars, Transform3D, ViewCoordinates,
+};
 use re_types::components::FillMode;
 use re_types::datatypes::{Mat3x3, Quaternion};
 
@@ -58,15 +60,17 @@ impl Recording {
         let info = StoreInfo::new(store, StoreSource::Other(concat!("muybridge ", env!("CARGO_PKG_VERSION")).into()));
         let row_id = recording.next();
         recording.encoder.append(&LogMsg::SetStoreInfo(SetStoreInfo { row_id, info }))?;
+        // What the viewer lists it by.
+        recording.always(EntityPath::properties(), &RecordingInfo::new().with_name(session))?;
         let axes = match rig.up {
             Up::Y => ViewCoordinates::RIGHT_HAND_Y_UP(),
             Up::Z => ViewCoordinates::RIGHT_HAND_Z_UP(),
         };
-        recording.always(&["world"], &axes)?;
+        recording.always(path(&["world"]), &axes)?;
         for camera in &rig.cameras {
             let (pose, pinhole) = (world_from_camera(camera), pinhole(camera));
-            recording.always(&["world", "cameras", &camera.name], &pose)?;
-            recording.always(&["world", "cameras", &camera.name], &pinhole)?;
+            recording.always(path(&["world", "cameras", &camera.name]), &pose)?;
+            recording.always(path(&["world", "cameras", &camera.name]), &pinhole)?;
         }
         let offsets = fit.shape().offsets();
         let placements: Vec<Placement> = fit.poses.iter().map(|pose| place(&offsets, pose)).collect();
@@ -103,9 +107,9 @@ impl Recording {
         self.last
     }
 
-    fn always(&mut self, entity: &[&str], what: &dyn AsComponents) -> Result<(), RecordingError> {
+    fn always(&mut self, entity: EntityPath, what: &dyn AsComponents) -> Result<(), RecordingError> {
         let (chunk, row) = (ChunkId::from_tuid(self.next()), RowId::from_tuid(self.next()));
-        self.append(Chunk::builder_with_id(chunk, path(entity)).with_archetype(row, TimePoint::default(), what).build()?)
+        self.append(Chunk::builder_with_id(chunk, entity).with_archetype(row, TimePoint::default(), what).build()?)
     }
 
     fn log<A: AsComponents>(&mut self, entity: &[&str], rows: impl IntoIterator<Item = (TimePoint, A)>) -> Result<(), RecordingError> {
