@@ -152,7 +152,7 @@ pub fn hypotheses(track: &Track, frames: &[Frame], curve: &Curve, model: &Model,
             .collect()
     };
     let chosen: Vec<usize> = (0..frames.len()).step_by(frames.len().div_ceil(SEARCH_FRAMES)).collect();
-    let searched: Vec<Frame> = chosen.iter().map(|t| frames[*t].clone()).collect();
+    let searched: Vec<Frame> = chosen.iter().map(|t| frames[*t].half()).collect();
     let last = frames.last().map_or(0.0, |f| f.time_s) - frames.first().map_or(0.0, |f| f.time_s);
     let mut grid = Vec::new();
     for heading in &headings {
