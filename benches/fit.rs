@@ -13,7 +13,7 @@ use muybridge::body::{Joint, Length, PosedSurface, Shape, Surface};
 use muybridge::fit::SETTINGS;
 use muybridge::fit::curve::Curve;
 use muybridge::fit::problem::{Frame, Free, Known, Problem, Target};
-use muybridge::fit::state::{Carrier, State, Turns};
+use muybridge::fit::state::{Carrier, Posture, State};
 use muybridge::math::arrow::{ArrowProblem, LmOptions, minimise};
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, Model, SAMPLES, synthetic};
@@ -59,7 +59,7 @@ fn walker(model: &Model, curve: &Curve, frames: usize) -> State {
         let heading = exp(&Vector3::new(0.0, std::f64::consts::FRAC_PI_2 - angle, 0.0));
         Carrier { position, world_from_carrier: heading, phase: 0.93 * time_s }
     });
-    State { carriers: carriers.collect(), weights, shape, posture: Turns::default(), deviations: Vec::new() }
+    State { carriers: carriers.collect(), weights, shape, posture: Posture::default(), deviations: Vec::new() }
 }
 
 /// Where the solver starts: the mean person, turned, shifted and out of step.

@@ -9,7 +9,7 @@ use muybridge::body::{Joint, NODES, Pose, PosedSurface, Shape, Surface, place};
 use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::problem::{Frame, Free, Known, Problem, Settings, Target};
-use muybridge::fit::state::{Carrier, State, Turns};
+use muybridge::fit::state::{Carrier, Posture, State};
 use muybridge::fit::{Checkpoint, Checkpoints, FitOptions, Observation, PointResidual, Silhouette, contest, fit, resume};
 use muybridge::math::arrow::{LmOptions, minimise};
 use muybridge::motion::{Length, play_cycle};
@@ -59,7 +59,7 @@ fn walker(curve: &Curve, frames: usize, fps: f64) -> State {
         }
     });
     let weights = curve.eigenvalues.iter().enumerate().map(|(i, lambda)| lambda.sqrt() * if i % 3 == 1 { -1.0 } else { 1.0 });
-    State { carriers: carriers.collect(), weights: weights.collect(), shape, posture: Turns::default(), deviations: Vec::new() }
+    State { carriers: carriers.collect(), weights: weights.collect(), shape, posture: Posture::default(), deviations: Vec::new() }
 }
 
 fn positions(shape: &Shape, poses: &[Pose]) -> Vec<[Vector3<f64>; NODES]> {
@@ -217,6 +217,7 @@ fn exact_points_give_exact_weights_when_nothing_else_pulls() {
         arm_length: none,
         width: none,
         posture: none,
+        wrist: none,
         deviation: none,
         turn_acceleration: none,
     };
