@@ -84,7 +84,8 @@ fn a_track_is_recorded_whole_and_the_same_every_time() {
             assert_eq!(timelines, ["frame", "time"], "{entity}");
         }
         let rows: usize = moving.iter().map(|chunk| chunk.num_rows()).sum();
-        let still = ["/world", "/__properties"].contains(&entity.as_str()) || entity.starts_with("/world/cameras") && !entity.ends_with("/picture");
+        let still =
+            ["/world", "/__properties"].contains(&entity.as_str()) || entity.starts_with("/world/cameras") && !entity.ends_with("/picture");
         assert_eq!(rows, if still { 0 } else { FRAMES }, "{entity}");
     }
 
