@@ -9,6 +9,7 @@
 //! degrees better, but points left out of the fit farther off, and recorded runners 1.6 degrees worse.
 //! Checked against the phantom's known truth and against footage of a mesh person with known joints.
 
+pub mod carrier;
 pub mod contest;
 pub mod curve;
 pub mod own_motion;
@@ -30,6 +31,7 @@ use crate::body::{Pose, Shape};
 use crate::math::arrow::{LmOptions, minimise};
 use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
+use carrier::Accelerations;
 pub use contest::Candidate;
 use curve::Curve;
 use problem::{Frame, Free, Known, Problem, Settings};
@@ -119,7 +121,7 @@ pub struct Fit {
     pub up: Vector3<f64>,
 }
 
-/// The last stages of a fit. Accelerations are those of a steady walk: larger values let noise through, smaller ones cut corners.
+/// The last stages of a fit; [`settings`] has the accelerations of a model's people.
 pub const SETTINGS: Settings = Settings {
     residual: PointResidual::Distance,
     at_skin: true,
@@ -127,8 +129,8 @@ pub const SETTINGS: Settings = Settings {
     point_weight: 0.16,
     ray_weight: 0.16,
     outside_weight: 0.3,
-    acceleration: 1.35,
-    angular_acceleration: 5.4,
+    acceleration: carrier::STEADY.linear_m_s2,
+    angular_acceleration: carrier::STEADY.angular_rad_s2,
     phase_acceleration: 1.35,
     tilt: 0.08,
     stature: 0.03,
@@ -140,6 +142,19 @@ pub const SETTINGS: Settings = Settings {
     deviation: 0.1,
     turn_acceleration: 40.0,
 };
+
+/// [`SETTINGS`] for somebody who moves as the people of `model` do and is not one of them, in frames every `frame_s` seconds.
+pub fn settings(model: &Model, components: usize, frame_s: f64) -> Settings {
+    let Accelerations { linear_m_s2, angular_rad_s2 } = carrier::accelerations(model, components, frame_s);
+    Settings { acceleration: linear_m_s2, angular_acceleration: angular_rad_s2, ..SETTINGS }
+}
+
+/// The usual time between frames.
+fn frame_s(times_s: &[f64]) -> f64 {
+    let mut between: Vec<f64> = times_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    between.sort_by(f64::total_cmp);
+    between.get(between.len() / 2).copied().unwrap_or(0.0)
+}
 
 /// A second person in more than one of so many frames is one too many.
 const CROWDED: usize = 4;
@@ -274,7 +289,8 @@ pub fn resume(
     state.weights.resize(ten.components(), 0.0);
 
     let mut run = Run { known, iterations: 0, checkpoints, stages: 0 };
-    let settings = Settings { residual: options.residual, ..SETTINGS };
+    let components = options.variance.map_or(options.components, |part| model.components(part));
+    let settings = Settings { residual: options.residual, ..settings(model, components, frame_s(&times)) };
     let dense: Vec<Frame> = choices.par_iter().map(|c| c.frame(rig, options.points, options.rays)).collect();
     // Half of the targets, each for two, lead there as well.
     let half: Vec<Frame> = dense.iter().map(Frame::half).collect();
@@ -285,7 +301,7 @@ pub fn resume(
     let approaching = |free, settings, refreshes| Stage { free, settings, refreshes, least_change: ROUGHLY };
     state = run.stage(state, &half, &ten, &approaching(STYLED, Settings { model_m: 0.03, ..approach }, 5));
     step(0.55)?;
-    let curve = Curve::new(model, options.variance.map_or(options.components, |part| model.components(part)));
+    let curve = Curve::new(model, components);
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &half, &curve, &approaching(shaped, approach, 10));
     step(0.7)?;

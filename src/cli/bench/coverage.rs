@@ -10,7 +10,7 @@ use clap::Args;
 use muybridge::body::{Joint, Length, Pose, Shape, Surface, place};
 use muybridge::fit::curve::Curve;
 use muybridge::fit::state::{Carrier, DEVIATING, HELD, Posture, State, Turns};
-use muybridge::fit::{Fit, FitOptions, SETTINGS};
+use muybridge::fit::{Fit, FitOptions, SETTINGS, settings};
 use muybridge::math::rotation::exp;
 use muybridge::motion_model::{Activity, Model};
 use muybridge::phantom::{SightOptions, staging, truth::SCORED};
@@ -130,10 +130,11 @@ impl Person {
         ])));
         let middle = Vector3::new(0.0, DISTANCE_M, shape.hip_height_m());
         let unsteady = if gliding { 0.0 } else { 1.0 };
+        let settings = settings(model, components, 1.0 / FPS);
         let mut wobble = |sigma: f64| wobble(unsteady * sigma, &mut rng);
-        let moved: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(SETTINGS.acceleration));
-        let turned: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(SETTINGS.angular_acceleration));
-        let ahead = wobble(SETTINGS.phase_acceleration);
+        let moved: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(settings.acceleration));
+        let turned: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(settings.angular_acceleration));
+        let ahead = wobble(settings.phase_acceleration);
         let carrier = |t: usize| {
             let time_s = (t as f64 - 0.5 * (FRAMES - 1) as f64) / FPS;
             let of = |channels: &[Vec<f64>; 3]| Vector3::from_fn(|axis, _| channels[axis][t]);
@@ -147,7 +148,7 @@ impl Person {
         let mut state = State { carriers, weights, shape, posture: Posture::default(), deviations: Vec::new() };
         if !gliding {
             for (turn, joint) in state.posture.iter_mut().zip(HELD) {
-                turn.iter_mut().for_each(|angle| *angle = SETTINGS.posture_of(joint) * normal(&mut rng));
+                turn.iter_mut().for_each(|angle| *angle = settings.posture_of(joint) * normal(&mut rng));
             }
             state.deviations = vec![Turns::default(); FRAMES];
             for (joint, axis) in (0..DEVIATING.len()).flat_map(|joint| (0..3).map(move |axis| (joint, axis))) {
