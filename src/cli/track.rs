@@ -88,15 +88,8 @@ impl NamedModel {
         Activity::ALL.into_par_iter().map(NamedModel::synthetic).collect()
     }
 
-    /// The models of a session's options.
-    fn of(config: &SessionConfig) -> Result<Vec<NamedModel>> {
-        match config.activity {
-            _ if !config.model.is_empty() => {
-                config.model.iter().map(|path| Ok(NamedModel::new(model_npz::read_model(path)?, file_name(path)))).collect()
-            }
-            Some(activity) => Ok(vec![NamedModel::synthetic(activity)?]),
-            None => NamedModel::embedded(),
-        }
+    fn read(path: &PathBuf) -> Result<NamedModel> {
+        Ok(NamedModel::new(model_npz::read_model(path)?, file_name(path)))
     }
 
     fn report_name(&self) -> ModelName {
@@ -135,8 +128,8 @@ impl TrackArgs {
 
 pub fn run(args: &TrackArgs) -> Result<()> {
     let config = args.config()?;
-    let models = NamedModel::of(&config)?;
-    if models.iter().any(|model| model.model.synthetic) {
+    let mut models = config.model.iter().map(NamedModel::read).collect::<Result<Vec<_>>>()?;
+    if models.is_empty() || models.iter().any(|model| model.model.synthetic) {
         eprintln!(
             "note: the model is synthetic; for figures that mean something build one from motion capture with `muybridge model build`"
         );
@@ -144,7 +137,15 @@ pub fn run(args: &TrackArgs) -> Result<()> {
     let (session, notices) = Session::open(&args.session, args.fps)?;
     notices.iter().for_each(|notice| eprintln!("note: {notice}"));
     let options = FitOptions { variance: config.variance, ..FitOptions::default() };
-    let seen = look(&session, args.work.as_deref(), |_, _, _| Ok(()))?;
+    // Embedded models take a second, in which one core would wait.
+    let embedded = || match config.activity {
+        _ if !models.is_empty() => Ok(Vec::new()),
+        Some(activity) => Ok(vec![NamedModel::synthetic(activity)?]),
+        None => NamedModel::embedded(),
+    };
+    let (seen, embedded) = rayon::join(|| look(&session, args.work.as_deref(), |_, _, _| Ok(())), embedded);
+    let (seen, embedded) = (seen?, embedded?);
+    models.extend(embedded);
     let hashes: Vec<&str> = models.iter().map(|m| m.hash.as_str()).collect();
     let kept = args.work.as_ref().map(|work| kept_folder(work, "fit", &session, &format!("{hashes:?} {options:?} {}", session.fps)));
     let tracked = fit_to(&session, seen, &models, &options, kept.transpose()?.as_deref())?;

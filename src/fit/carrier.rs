@@ -1,7 +1,7 @@
 //! How unsteadily a person's carrier moves.
 //!
 //! The carrier takes what of the root's motion the model's components do not hold. How much that is for somebody who is not in the
-//! model, its own people tell: each against the model of the others, with α in the stored components of all,
+//! model, its own people tell: each against the model of the others, with α in the leading components of all,
 //!   e = r − r̄' − P' U'ᵀ (α − ᾱ'),                                                                                    (1)
 //! ᾱ', U' mean and axes of the others' α, r̄', P' mean and loadings of their root channels. The standard deviation of accelerations
 //! is the median over all cycles (some recordings are shaken) of the root mean square of (e₊ − 2 e + e₋) / h², h the time between frames:
@@ -11,6 +11,7 @@
 //! Fails when: the database has one subject, or shows the same motion many times; [`STEADY`] is the least.
 //! Checked against made-up people whose roots differ by a known oscillation.
 
+use nalgebra::{DMatrix, DVectorView};
 use rayon::prelude::*;
 
 use crate::motion_model::{Member, Model, ROOT_CHANNELS, SAMPLES};
@@ -25,10 +26,16 @@ pub struct Accelerations {
 /// Of a steady walk; less lets the carrier cut corners.
 pub const STEADY: Accelerations = Accelerations { linear_m_s2: 1.35, angular_rad_s2: 5.4 };
 
+/// So many times the components used tell the axes of the others.
+const TELLING: usize = 2;
+
 /// Those of somebody who is not in `model`, of which the fit uses so many `components`, seen every `frame_s` seconds.
 pub fn accelerations(model: &Model, components: usize, frame_s: f64) -> Accelerations {
-    let weighed = |m: &Member| Member { vector: model.member_weights(m), ..bare(m) };
-    let members: Vec<Member> = model.members.par_iter().map(weighed).collect();
+    let vectors = DMatrix::from_columns(&model.members.iter().map(|m| &m.vector - &model.mean).collect::<Vec<_>>());
+    // A product with a transposed copy runs in blocks, one by one they do not.
+    let weights = model.basis.columns(0, model.basis.ncols().min(TELLING * components)).transpose() * vectors;
+    let weighed = |(m, weights): (&Member, DVectorView<f64>)| Member { vector: weights.into_owned(), ..bare(m) };
+    let members: Vec<Member> = model.members.iter().zip(weights.column_iter()).map(weighed).collect();
     let left_out = |subject: &&str| {
         let others = members.iter().filter(|m| m.subject != **subject).cloned().collect();
         let Ok(others) = Model::from_members(model.activity, model.synthetic, model.mean_rotations, others) else { return Vec::new() };

@@ -104,7 +104,7 @@ impl SyntheticSubject {
         }
     }
 
-    fn sole(&self, angles: &Angles, side: usize) -> (posture::Sole, f64) {
+    fn sole(&self, angles: &Angles, side: usize) -> posture::Sole {
         angles.sole(side, &self.offsets, self.stature_m)
     }
 

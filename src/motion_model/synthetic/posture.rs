@@ -128,24 +128,37 @@ impl Angles {
         [hip, pitch(side.knee), ankle, pitch(-side.toe)]
     }
 
-    /// Sole points of one side relative to the root, and the foot's pitch (toes up positive).
-    pub fn sole(&self, s: usize, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> (Sole, f64) {
+    /// Sole points of one side relative to the root.
+    pub fn sole(&self, s: usize, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> Sole {
         let (side, names) = (&self.sides[s], &SIDES[s]);
-        let sign = if s == 0 { 1.0 } else { -1.0 };
-        let (tilted, out) = (list(side.leg_lateral), yaw(sign * side.toe_out));
+        let tilted = list(side.leg_lateral);
         // The leg is flat up to the ankle, so angles add up.
         let thigh = self.tilt - side.hip_flexion;
-        let bone = |length: f64, angle: f64| Vector3::new(0.0, -length * angle.cos(), -length * angle.sin());
+        let bone = |length: f64, angle: f64| {
+            let (sin, cos) = angle.sin_cos();
+            Vector3::new(0.0, -length * cos, -length * sin)
+        };
         let (knee, ankle) = (-offsets[names.knee as usize].y, -offsets[names.ankle as usize].y);
         let at_ankle = side.hip + tilted * (bone(knee, thigh) + bone(ankle, thigh + side.knee));
-        let rotation = tilted * pitch(thigh + side.knee) * tilted.inverse() * out * pitch(-side.ankle);
+        let rotation = self.carrier_from_foot(s);
         let at_ball = at_ankle + rotation * offsets[names.midtarsal as usize];
-        let sole = [
+        [
             at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
             at_ball + rotation * (Vector3::new(0.0, -BALL_HEIGHT, 0.0) * stature_m),
             at_ball + rotation * (pitch(-side.toe) * (Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD) * stature_m)),
-        ];
-        (sole, (rotation * Vector3::z()).y.asin())
+        ]
+    }
+
+    fn carrier_from_foot(&self, s: usize) -> UnitQuaternion<f64> {
+        let side = &self.sides[s];
+        let sign = if s == 0 { 1.0 } else { -1.0 };
+        let (tilted, out) = (list(side.leg_lateral), yaw(sign * side.toe_out));
+        tilted * pitch(self.tilt - side.hip_flexion + side.knee) * tilted.inverse() * out * pitch(-side.ankle)
+    }
+
+    /// Pitch of the foot of one side, toes up positive.
+    pub fn foot_pitch(&self, s: usize) -> f64 {
+        (self.carrier_from_foot(s) * Vector3::z()).y.asin()
     }
 }
 

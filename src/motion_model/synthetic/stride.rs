@@ -105,7 +105,7 @@ pub(super) fn cycle(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait) ->
 /// By how much the hip must extend so that the foot stands under the body in mid stance as far ahead as in other people.
 fn too_far_ahead(subject: &SyntheticSubject, angles: &[Angles], side: usize) -> f64 {
     let middle = (0..SAMPLES).find(|&i| own_phase(i, side) == 0.24).unwrap_or(0);
-    let ahead = subject.sole(&angles[middle], side).0[2].z / subject.stature_m - TOE_AHEAD;
+    let ahead = subject.sole(&angles[middle], side)[2].z / subject.stature_m - TOE_AHEAD;
     (ahead - TOE_AHEAD_SPREAD * (ahead / TOE_AHEAD_SPREAD).tanh()) * subject.stature_m / subject.hip_height_m
 }
 
@@ -118,7 +118,7 @@ struct Path {
 
 /// Height and progress as the leading foot dictates, from its heel strike until its heel rises; in between smoothly on.
 fn leading_path(subject: &SyntheticSubject, gait: &Gait, angles: &[Angles]) -> Path {
-    let soles: Vec<Soles> = angles.iter().map(|a| [0, 1].map(|side| subject.sole(a, side).0)).collect();
+    let soles: Vec<Soles> = angles.iter().map(|a| [0, 1].map(|side| subject.sole(a, side))).collect();
     let contact = |from: f64, until: f64| -> Vec<[f64; 2]> {
         let stands = |i, side| if (from..until).contains(&own_phase(i, side)) { 1.0 } else { 0.0 };
         (0..SAMPLES).map(|i| [stands(i, 0), stands(i, 1)]).collect()
@@ -179,7 +179,7 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
     let at = |k: usize| (strike + k) % SAMPLES;
     let ahead = |k: usize| path.ahead_m[at(k)] + path.stride_m * ((strike + k) / SAMPLES) as f64;
     let flat: Vec<usize> = (0..SAMPLES).filter(|&k| (gait.laid_flat.1..gait.heel_rises.0).contains(&phase(k))).collect();
-    let toe_z = flat.iter().map(|&k| ahead(k) + subject.sole(&angles[at(k)], side).0[2].z).sum::<f64>() / flat.len() as f64;
+    let toe_z = flat.iter().map(|&k| ahead(k) + subject.sole(&angles[at(k)], side)[2].z).sum::<f64>() / flat.len() as f64;
     let correction = |k: usize| {
         let rise = smooth_step(gait.heel_rises.0 - 0.02, gait.heel_rises.1 - 0.02, phase(k));
         let target = [toe_z - ahead(k), -path.height_m[at(k)]];
@@ -195,7 +195,7 @@ fn plant(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: u
         let fade_out = 1.0 - smooth_step(gait.support + gait.lets_go.0, gait.support + gait.lets_go.1, t);
         let by = turns.get(k).unwrap_or(&last) * fade_out + first * smooth_step(0.85, 1.0, t);
         turn(&mut angles[at(k)].sides[side], &by);
-        bend_toes(subject, &mut angles[at(k)], side, t, gait);
+        bend_toes(&mut angles[at(k)], side, t, gait);
     }
 }
 
@@ -215,7 +215,7 @@ fn hold_flat(subject: &SyntheticSubject, angles: &Angles, side: usize, t: f64, t
     let miss = |v: &Vector2<f64>| {
         let mut angles = *angles;
         turn(&mut angles.sides[side], &of_hip_and_knee(v));
-        let [heel, ball, toe] = subject.sole(&angles, side).0;
+        let [heel, ball, toe] = subject.sole(&angles, side);
         let z = toe_share * toe.z + (1.0 - toe_share) * (heel.z + FOOT_LENGTH * subject.stature_m) - target[0];
         let sinks_m = if gait.bounces { 0.0 } else { SINKS_M };
         Vector2::new(z, heel.y.min(ball.y).min(toe.y) + sinks_m - target[1])
@@ -253,8 +253,8 @@ fn stand_on_toes(subject: &SyntheticSubject, angles: &Angles, side: usize, targe
     let miss = |by: &Vector3<f64>| {
         let mut angles = *angles;
         turn(&mut angles.sides[side], by);
-        bend_toes(subject, &mut angles, side, gait.heel_rises.1.min(gait.support), gait);
-        let [heel, ball, toe] = subject.sole(&angles, side).0;
+        bend_toes(&mut angles, side, gait.heel_rises.1.min(gait.support), gait);
+        let [heel, ball, toe] = subject.sole(&angles, side);
         Vector2::new(toe.z - target[0], heel.y.min(ball.y).min(toe.y) - target[1])
     };
     let mut by = Vector3::zeros();
@@ -284,7 +284,7 @@ fn turn(leg: &mut Side, by: &Vector3<f64>) {
 /// A swinging foot that would touch the floor is lifted by ankle, knee and hip.
 fn clear_floor(subject: &SyntheticSubject, angles: &mut [Angles], path: &Path, side: usize, gait: &Gait) {
     let lowest = |angles: &Angles| {
-        let [heel, ball, toe] = subject.sole(angles, side).0.map(|p| p.y);
+        let [heel, ball, toe] = subject.sole(angles, side).map(|p| p.y);
         // A walker's heel comes down by itself at the end of the swing, and dorsiflexion would only lower it.
         if gait.bounces && heel < ball.min(toe) { (heel, LIFT_HEEL) } else { (ball.min(toe), LIFT) }
     };
@@ -337,13 +337,13 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64, l
             let adduction = sample[track(Channel::HipAdduction, side)] - mean[track(Channel::HipAdduction, side)];
             let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.1 * adduction.to_radians();
             for _ in 0..2 {
-                let [heel, _, toe] = subject.sole(&angles, side).0;
+                let [heel, _, toe] = subject.sole(&angles, side);
                 angles.sides[side].leg_lateral += foot_x - 0.5 * (heel.x + toe.x) / subject.hip_height_m;
             }
             let t = own_phase(i, side);
             let flat = smooth_step(gait.laid_flat.0, gait.laid_flat.1, t) * (1.0 - smooth_step(gait.heel_rises.0, gait.heel_rises.1, t));
-            angles.sides[side].ankle -= flat * subject.sole(&angles, side).1;
-            bend_toes(subject, &mut angles, side, t, gait);
+            angles.sides[side].ankle -= flat * angles.foot_pitch(side);
+            bend_toes(&mut angles, side, t, gait);
         }
         angles
     };
@@ -351,9 +351,9 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64, l
 }
 
 /// Toes stay level while the heel is up, as far as they bend, and stretch after toe-off.
-fn bend_toes(subject: &SyntheticSubject, angles: &mut Angles, side: usize, t: f64, gait: &Gait) {
-    let heel_up = above_zero(-subject.sole(angles, side).1, 0.03);
+fn bend_toes(angles: &mut Angles, side: usize, t: f64, gait: &Gait) {
     let (rises, off) = (gait.heel_rises.0, gait.support);
     let standing = smooth_step(rises - 0.12, rises - 0.02, t) * (1.0 - smooth_step(off, off + 0.15, t));
-    angles.sides[side].toe = standing * TOE_LIMIT * (heel_up / TOE_LIMIT).tanh();
+    let bent = |pitch: f64| TOE_LIMIT * (above_zero(-pitch, 0.03) / TOE_LIMIT).tanh();
+    angles.sides[side].toe = if standing > 0.0 { standing * bent(angles.foot_pitch(side)) } else { 0.0 };
 }

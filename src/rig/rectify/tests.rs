@@ -261,6 +261,23 @@ fn warped_pictures_show_points_where_they_belong() {
 }
 
 #[test]
+fn the_way_back_is_the_lenss_inverse() {
+    let mut rig = random_rig(&mut ChaCha8Rng::seed_from_u64(9), false);
+    rig.cameras[0].lens = crate::rig::Lens::BrownConrady([-0.25, 0.08, 1e-3, -1e-3, 0.0, 0.0, 0.0, 0.0]);
+    rig.cameras[1].lens = crate::rig::Lens::BrownConrady([0.2, -0.05, -1e-3, 1e-3, 0.01, 0.0, 0.0, 0.0]);
+    rig.cameras[2].lens = crate::rig::Lens::Fisheye([-0.02, 0.004, -0.003, 0.0005]);
+    let rectification = rectify(&rig, &[0, 1, 2]).unwrap();
+    for (k, view) in rectification.views.iter().enumerate() {
+        let off = |(i, found): (usize, &[f32; 2])| {
+            let exact = rectification.rectified_pixel(k, &Point2::new((i % 640) as f64, (i / 640) as f64)).unwrap();
+            (Vector2::new(found[0].into(), found[1].into()) - exact).norm()
+        };
+        let most = view.back_map.iter().enumerate().map(off).fold(0.0, f64::max);
+        assert!(most < if view.camera.lens.is_fisheye() { 1e-4 } else { 0.01 }, "{}: {most} px", view.camera.name);
+    }
+}
+
+#[test]
 fn impossible_groups_are_refused_and_groups_cover_every_camera() {
     let mut random = ChaCha8Rng::seed_from_u64(7);
     let mut rig = random_rig(&mut random, false);
