@@ -216,7 +216,7 @@ fn bytes_of(problem: &Problem, curve: &Curve, start: &State) -> Vec<u8> {
         let counted: Vec<_> = frozen.iter().filter(|f| f.weight > 0.0).collect();
         out.push(counted.len() as f64);
         for f in counted {
-            out.extend([f.x.x, f.x.y, f.x.z, f.metres_per_root, f.weight, f.near.indices().count() as f64]);
+            out.extend([f.x.x, f.x.y, f.x.z, f.offset_m, f.metres_per_root, f.weight, f.near.indices().count() as f64]);
             out.extend(f.near.indices().map(|i| i as f64));
         }
     }

@@ -105,7 +105,7 @@ struct Primitive {
 };
 struct Point {
   V3 x;
-  double metres_per_root, root_weight;
+  double offset_m, metres_per_root, root_weight;
   std::vector<int> near;
 };
 struct Frame {
@@ -205,6 +205,7 @@ Data read(const char* path) {
     d.frames[t].points.resize(r.count());
     for (Point& p : d.frames[t].points) {
       p.x = r.vector();
+      p.offset_m = r.number();
       p.metres_per_root = r.number();
       p.root_weight = std::sqrt(r.number());
       p.near.resize(r.count());
@@ -350,7 +351,7 @@ class Points : public ceres::CostFunction {
       const double d_eff = nearest - 0.5 * std::log(sum), shallow = std::sqrt(std::max(d_eff, kDeep)), slope = 0.5 / shallow;
       const double value = shallow + (d_eff - std::max(d_eff, kDeep)) * slope;
       const double scale = point.root_weight * point.metres_per_root;
-      residuals[i] = scale * (value - kSkin);
+      residuals[i] = point.root_weight * point.offset_m + scale * (value - kSkin);
       if (!jacobians) continue;
       for (size_t k = 0; k < count; ++k) force[k] = force[k] * (-scale * slope / sum);
       jacobian_row(motion, posed, point, unit, force, root, z, row);
