@@ -88,7 +88,7 @@ impl NamedModel {
         Activity::ALL.into_par_iter().map(NamedModel::synthetic).collect()
     }
 
-    fn read(path: &PathBuf) -> Result<NamedModel> {
+    fn read(path: &Path) -> Result<NamedModel> {
         Ok(NamedModel::new(model_npz::read_model(path)?, file_name(path)))
     }
 
@@ -128,7 +128,7 @@ impl TrackArgs {
 
 pub fn run(args: &TrackArgs) -> Result<()> {
     let config = args.config()?;
-    let mut models = config.model.iter().map(NamedModel::read).collect::<Result<Vec<_>>>()?;
+    let mut models = config.model.iter().map(|path| NamedModel::read(path)).collect::<Result<Vec<_>>>()?;
     if models.is_empty() || models.iter().any(|model| model.model.synthetic) {
         eprintln!(
             "note: the model is synthetic; for figures that mean something build one from motion capture with `muybridge model build`"

@@ -11,7 +11,7 @@
 //! Fails when: the database has one subject, or shows the same motion many times; [`STEADY`] is the least.
 //! Checked against made-up people whose roots differ by a known oscillation.
 
-use nalgebra::{DMatrix, DVectorView};
+use nalgebra::DVectorView;
 use rayon::prelude::*;
 
 use crate::motion_model::{Member, Model, ROOT_CHANNELS, SAMPLES};
@@ -31,9 +31,7 @@ const TELLING: usize = 2;
 
 /// Those of somebody who is not in `model`, of which the fit uses so many `components`, seen every `frame_s` seconds.
 pub fn accelerations(model: &Model, components: usize, frame_s: f64) -> Accelerations {
-    let vectors = DMatrix::from_columns(&model.members.iter().map(|m| &m.vector - &model.mean).collect::<Vec<_>>());
-    // A product with a transposed copy runs in blocks, one by one they do not.
-    let weights = model.basis.columns(0, model.basis.ncols().min(TELLING * components)).transpose() * vectors;
+    let weights = model.leading_weights(TELLING * components);
     let weighed = |(m, weights): (&Member, DVectorView<f64>)| Member { vector: weights.into_owned(), ..bare(m) };
     let members: Vec<Member> = model.members.iter().zip(weights.column_iter()).map(weighed).collect();
     let left_out = |subject: &&str| {

@@ -102,8 +102,9 @@ pub fn hash(header: &impl Serialize, arrays: &[Array]) -> String {
         for n in &array.shape {
             hasher.update(&n.to_le_bytes());
         }
-        for v in &array.values {
-            hasher.update(&v.to_le_bytes());
+        // Many chunks together are hashed side by side.
+        for values in array.values.chunks(8192) {
+            hasher.update(&values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>());
         }
     }
     hasher.finalize().to_hex().to_string()

@@ -1,7 +1,8 @@
-//! Principal components of few long vectors, through the M×M Gram matrix.
+//! Principal components, of few long vectors through the M×M Gram matrix.
 //!
 //! With centred examples X (D×M):  XᵀX/M · u = λ u,   Θ = X u / √(Mλ)                                     (1)
-//! gives the same Θ and λ as the D×D covariance XXᵀ/M. λ has the divisor M, so the λ sum to the total variance.
+//! gives the same Θ and λ as the D×D covariance XXᵀ/M, which is taken where it is the smaller one. λ has the divisor M, so the λ sum to
+//! the total variance.
 //! Signs are a convention: the entry of Θ_i with the largest magnitude is positive.
 //! Checked against the singular values of X and against the covariance's eigenvectors.
 
@@ -39,14 +40,17 @@ fn with(examples: &DMatrix<f64>, count: impl Fn(&[f64]) -> usize) -> Pca {
     let mut centred = examples.clone();
     centred.column_iter_mut().for_each(|mut column| column -= &mean);
     // A product with a transposed copy runs in blocks, `tr_mul` does not.
-    let eigen = (centred.transpose() * &centred / m as f64).symmetric_eigen();
-    let mut order: Vec<usize> = (0..m).collect();
+    let few = m <= d;
+    let products = if few { centred.transpose() * &centred } else { &centred * centred.transpose() };
+    let eigen = (products / m as f64).symmetric_eigen();
+    let mut order: Vec<usize> = (0..m.min(d)).collect();
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
     order.truncate((m - 1).min(d));
     let eigenvalues: Vec<f64> = order.iter().map(|&i| eigen.eigenvalues[i].max(0.0)).collect();
     let real = eigenvalues.iter().take_while(|&&l| l > NULL_SPACE * eigenvalues[0]).count();
     let kept = real.min(count(&eigenvalues));
-    let mut basis = &centred * eigen.eigenvectors.select_columns(&order[..kept]);
+    let vectors = eigen.eigenvectors.select_columns(&order[..kept]);
+    let mut basis = if few { &centred * vectors } else { vectors };
     for mut component in basis.column_iter_mut() {
         let sign = if component[component.iamax()] < 0.0 { -1.0 } else { 1.0 };
         component *= sign / component.norm();

@@ -4,7 +4,7 @@
 //!   J_l(v) = I + (1−cos φ)/φ² [v]× + (φ−sin φ)/φ³ [v]×²,  φ = |v|.                                   (1)
 //! Checked against central differences.
 
-use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3, Vector4};
 
 /// The matrix of the cross product: `hat(v) * x == v.cross(&x)`.
 pub fn hat(v: &Vector3<f64>) -> Matrix3<f64> {
@@ -37,7 +37,10 @@ pub fn left_jacobian(v: &Vector3<f64>) -> Matrix3<f64> {
 
 /// The rotation with the smallest sum of squared angles to `rotations` (Karcher mean); `None` for an empty slice.
 pub fn mean(rotations: &[UnitQuaternion<f64>]) -> Option<UnitQuaternion<f64>> {
-    let mut mean = *rotations.first()?;
+    let first = *rotations.first()?;
+    // The sum of the quaternions is near it already.
+    let sum: Vector4<f64> = rotations.iter().map(|q| q.coords * q.coords.dot(&first.coords).signum()).sum();
+    let mut mean = UnitQuaternion::try_new(sum.into(), 1e-9).unwrap_or(first);
     for _ in 0..50 {
         let step = rotations.iter().map(|q| log(&(mean.inverse() * q))).sum::<Vector3<f64>>() / rotations.len() as f64;
         mean = UnitQuaternion::new_normalize((mean * exp(&step)).into_inner());

@@ -81,11 +81,11 @@ struct Subjects {
 impl Subjects {
     fn of(population: &Population, model: &Model) -> Option<Subjects> {
         let count = population.components();
-        let basis = model.basis.columns(0, count);
+        let weights = model.leading_weights(count);
         let names: Vec<String> = population.curves.iter().map(|curve| curve.subject.clone()).collect();
         let own = |name: &String| -> Vec<(f64, DVector<f64>)> {
-            let members = model.members.iter().filter(|m| m.subject == *name);
-            members.map(|m| (m.parameter, basis.tr_mul(&(&m.vector - &model.mean)))).collect()
+            let members = model.members.iter().zip(weights.column_iter()).filter(|(m, _)| m.subject == *name);
+            members.map(|(m, weights)| (m.parameter, weights.into_owned())).collect()
         };
         let cycles: Vec<Vec<(f64, DVector<f64>)>> = names.iter().map(own).collect();
         let centre = |own: &Vec<(f64, DVector<f64>)>| {
