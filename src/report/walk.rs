@@ -74,7 +74,7 @@ pub(super) fn section(walk: &Walk) -> Markup {
     html! {
         p {
             "Heel strikes and toe-offs after Zeni et al. (2008). The footage shows " (count(0)) " whole strides of the left and "
-            (count(1)) " of the right foot. The fitted cycle is the same person walking on steadily, so that both sides are whole however short the footage."
+            (count(1)) " of the right foot. The fitted cycle is the same person going on steadily, so that both sides are whole however short the footage."
         }
         div.gallery.halves {
             div { h3 { "In the footage" } (lines(&filmed)) }
@@ -95,7 +95,11 @@ pub(super) fn lines(lines: &[Line]) -> Markup {
         let sd = m.sd.map_or(String::new(), |sd| format!(" ± {:.decimals$}", percent(line) * sd));
         format!("{:.decimals$}{sd}", percent(line) * m.mean)
     };
-    let asymmetry = |line: &Line| line.asymmetry_percent().map_or("\u{2013}".into(), |a| format!("{a:+.1} %"));
+    let asymmetry = |line: &Line| match line.asymmetry_percent() {
+        None => "\u{2013}".to_string(),
+        Some(a) if a.abs() < 0.05 => "0.0 %".to_string(),
+        Some(a) => format!("{a:+.1} %"),
+    };
     let rows: Vec<Vec<String>> = lines
         .iter()
         .filter(|l| l.both.is_some())
