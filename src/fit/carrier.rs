@@ -14,6 +14,7 @@
 use nalgebra::DVectorView;
 use rayon::prelude::*;
 
+use crate::math::order::quantile;
 use crate::motion_model::{Member, Model, ROOT_CHANNELS, SAMPLES};
 
 /// Standard deviations of a carrier's accelerations.
@@ -32,7 +33,7 @@ const TELLING: usize = 2;
 /// Those of somebody who is not in `model`, of which the fit uses so many `components`, seen every `frame_s` seconds.
 pub fn accelerations(model: &Model, components: usize, frame_s: f64) -> Accelerations {
     let weights = model.leading_weights(TELLING * components);
-    let weighed = |(m, weights): (&Member, DVectorView<f64>)| Member { vector: weights.into_owned(), ..bare(m) };
+    let weighed = |(m, weights): (&Member, DVectorView<f64>)| Member { vector: weights.into_owned(), ..m.clone() };
     let members: Vec<Member> = model.members.iter().zip(weights.column_iter()).map(weighed).collect();
     let left_out = |subject: &&str| {
         let others = members.iter().filter(|m| m.subject != **subject).cloned().collect();
@@ -42,25 +43,8 @@ pub fn accelerations(model: &Model, components: usize, frame_s: f64) -> Accelera
         own.map(|m| unsteadiness(m, (&m.root - others.root(others.member_weights(m).as_slice())).as_slice(), model, frame_s)).collect()
     };
     let all: Vec<[f64; 2]> = model.subjects().par_iter().flat_map_iter(left_out).collect();
-    let median = |kind: usize| {
-        let mut each: Vec<f64> = all.iter().map(|squares| squares[kind].sqrt()).collect();
-        each.sort_by(f64::total_cmp);
-        each.get(each.len() / 2).copied().unwrap_or(0.0)
-    };
+    let median = |kind: usize| quantile(all.iter().map(|squares| squares[kind].sqrt()).collect(), 0.5).unwrap_or(0.0);
     Accelerations { linear_m_s2: median(1).max(STEADY.linear_m_s2), angular_rad_s2: median(0).max(STEADY.angular_rad_s2) }
-}
-
-/// The member without its vector.
-fn bare(m: &Member) -> Member {
-    Member {
-        subject: m.subject.clone(),
-        source: m.source.clone(),
-        parameter: m.parameter,
-        hip_height_m: m.hip_height_m,
-        duration_s: m.duration_s,
-        vector: Default::default(),
-        root: m.root.clone(),
-    }
 }
 
 /// Mean squares of the accelerations of root channels `e` in the member's time: rad²/s⁴ and m²/s⁴, by axis.

@@ -29,6 +29,7 @@ use rayon::prelude::*;
 
 use crate::body::{Pose, Shape};
 use crate::math::arrow::{LmOptions, minimise};
+use crate::math::order::quantile;
 use crate::motion_model::{Activity, Model};
 use crate::rig::Rig;
 use carrier::Accelerations;
@@ -151,9 +152,7 @@ pub fn settings(model: &Model, components: usize, frame_s: f64) -> Settings {
 
 /// The usual time between frames.
 fn frame_s(times_s: &[f64]) -> f64 {
-    let mut between: Vec<f64> = times_s.windows(2).map(|pair| pair[1] - pair[0]).collect();
-    between.sort_by(f64::total_cmp);
-    between.get(between.len() / 2).copied().unwrap_or(0.0)
+    quantile(times_s.windows(2).map(|pair| pair[1] - pair[0]).collect(), 0.5).unwrap_or(0.0)
 }
 
 /// A second person in more than one of so many frames is one too many.

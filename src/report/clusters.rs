@@ -47,8 +47,10 @@ fn units(model: &Model, weights: &[f64]) -> [f64; 2] {
 }
 
 fn series(model: &Model) -> Vec<Curve> {
+    let weights = model.leading_weights(2);
     let one = |(k, subject): (usize, &str)| {
-        let points = model.members.iter().filter(|m| m.subject == subject).map(|m| units(model, model.project(&m.vector).as_slice()));
+        let own = model.members.iter().zip(weights.column_iter()).filter(|(m, _)| m.subject == subject);
+        let points = own.map(|(_, weights)| units(model, weights.as_slice()));
         Curve { label: subject.to_string(), points: points.collect(), dashed: false, colour: k, band: Vec::new() }
     };
     model.subjects().into_iter().enumerate().map(one).collect()

@@ -44,9 +44,10 @@ pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
     let scales = [scale(model, 0), scale(model, 1)];
     let place = |w: &[f64]| [0, 1].map(|i| w.get(i).copied().unwrap_or(0.0) / scales[i]);
     let (mut dots, mut names) = (Vec::new(), Vec::new());
+    let weights = model.leading_weights(2);
     for (k, subject) in model.subjects().into_iter().enumerate() {
-        let own = model.members.iter().filter(|m| m.subject == subject);
-        let points: Vec<[f64; 2]> = own.map(|m| place(model.member_weights(m).as_slice())).collect();
+        let own = model.members.iter().zip(weights.column_iter()).filter(|(m, _)| m.subject == subject);
+        let points: Vec<[f64; 2]> = own.map(|(_, weights)| place(weights.as_slice())).collect();
         let n = points.len() as f64;
         names.push(([0, 1].map(|a| points.iter().map(|p| p[a]).sum::<f64>() / n), subject.to_string()));
         dots.push(Dots { points, colour: k % INK, radius: 2.4, ..Dots::default() });

@@ -162,11 +162,11 @@ impl Population {
 
     /// The same subjects with their distances and how far their own cycles lie from their curves, nearest first.
     pub fn neighbours(&self, model: &Model, weights: &DVector<f64>, parameter: f64) -> Vec<Neighbour> {
-        let basis = model.basis.columns(0, self.components());
+        let of_members = model.leading_weights(self.components());
         let to = |c: &Curve| {
-            let own = model.members.iter().filter(|m| m.subject == c.subject).map(|m| {
-                Metric::Paper.distance(&self.eigenvalues, &basis.tr_mul(&(&m.vector - &model.mean)), &self.extended(c, m.parameter))
-            });
+            let own = model.members.iter().zip(of_members.column_iter()).filter(|(m, _)| m.subject == c.subject);
+            let own =
+                own.map(|(m, weights)| Metric::Paper.distance(&self.eigenvalues, &weights.into_owned(), &self.extended(c, m.parameter)));
             let here = self.extended(c, parameter);
             let distance = Metric::Paper.distance(&self.eigenvalues, weights, &here);
             let own_spread = own.fold(0.0, f64::max);

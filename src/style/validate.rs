@@ -264,7 +264,8 @@ impl Bench<'_> {
     }
 
     fn variability(&self, own: &[Member], own_knots: &[Knot], found: &mut LeftOut) {
-        let rest: Vec<DVector<f64>> = self.others.members.iter().map(|m| self.others.member_weights(m)).collect();
+        let rest: Vec<DVector<f64>> =
+            self.others.leading_weights(self.others.basis.ncols()).column_iter().map(|weights| weights.into_owned()).collect();
         let all: Vec<Shown> = own.iter().map(|m| self.shown_member(m)).collect();
         for (i, a) in own.iter().enumerate() {
             let same = |b: &&Member| own_knots.iter().any(|k| [a, *b].iter().all(|m| k.members.iter().any(|n| std::ptr::eq(*n, *m))));

@@ -9,10 +9,11 @@ use anyhow::{Context, Result};
 use clap::Args;
 use muybridge::body::{Joint, Length, Pose, Shape, Surface, place};
 use muybridge::fit::curve::Curve;
+use muybridge::fit::problem::Settings;
 use muybridge::fit::state::{Carrier, DEVIATING, HELD, Posture, State, Turns};
 use muybridge::fit::{Fit, FitOptions, SETTINGS, settings};
 use muybridge::math::rotation::exp;
-use muybridge::motion_model::{Activity, Model};
+use muybridge::motion_model::Activity;
 use muybridge::phantom::{SightOptions, staging, truth::SCORED};
 use muybridge::rig::Rig;
 use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, UnitQuaternion, Vector3};
@@ -74,12 +75,13 @@ const KINDS: [(&str, &str, f64); 8] = [
 pub fn run(args: &CoverageArgs) -> Result<()> {
     let model = NamedModel::synthetic(Activity::Walking)?.model;
     let options = FitOptions { deviations: !args.no_deviations, ..FitOptions::default() };
+    let (curve, settings) = (Curve::new(&model, options.components), settings(&model, options.components, 1.0 / FPS));
     let mut scores = Scores::default();
     let (mut shares, mut misfits, mut followed) = (Vec::new(), Vec::new(), 0);
     for repeat in 0..args.repeats {
         interrupt::check()?;
         let rig = LRig::default().rig();
-        let person = Person::draw(&model, options.components, &rig, repeat % args.people, args.gliding);
+        let person = Person::draw(&curve, &settings, &rig, repeat % args.people, args.gliding);
         let sight = SightOptions { seed: 1000 + repeat, disparity_px: args.disparity_noise, ..SightOptions::default() };
         let take = person.film(rig, &sight)?;
         let fit = fitted(&take, &[&model], &options)?;
@@ -110,8 +112,7 @@ struct Person {
 }
 
 impl Person {
-    fn draw(model: &Model, components: usize, rig: &Rig, seed: u64, gliding: bool) -> Person {
-        let curve = Curve::new(model, components);
+    fn draw(curve: &Curve, settings: &Settings, rig: &Rig, seed: u64, gliding: bool) -> Person {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut shape = Shape::template(1.6 + 0.25 * rng.random::<f64>());
         for i in 0..Length::COUNT {
@@ -130,7 +131,6 @@ impl Person {
         ])));
         let middle = Vector3::new(0.0, DISTANCE_M, shape.hip_height_m());
         let unsteady = if gliding { 0.0 } else { 1.0 };
-        let settings = settings(model, components, 1.0 / FPS);
         let mut wobble = |sigma: f64| wobble(unsteady * sigma, &mut rng);
         let moved: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(settings.acceleration));
         let turned: [Vec<f64>; 3] = std::array::from_fn(|_| wobble(settings.angular_acceleration));
@@ -156,7 +156,7 @@ impl Person {
                 state.deviations.iter_mut().zip(turns.iter()).for_each(|(of_frame, turn)| of_frame[joint][axis] = *turn);
             }
         }
-        let poses: Vec<Pose> = (0..FRAMES).map(|t| state.pose(&curve, t)).collect();
+        let poses: Vec<Pose> = (0..FRAMES).map(|t| state.pose(curve, t)).collect();
         let (surface, offsets) = (Surface::new(&state.shape), state.shape.offsets());
         let floor_m = poses.iter().map(|p| staging::lowest_m(&surface, &place(&offsets, p), rig.up)).fold(f64::INFINITY, f64::min);
         Person { state, poses, floor_m }
