@@ -249,18 +249,24 @@ pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &
     let placements = placements(fit);
     let frames: Vec<(usize, f64)> = observations.iter().map(|o| (o.number, o.time_s)).collect();
     let positions: Vec<[Vector3<f64>; NODES]> = placements.iter().map(|p| p.positions).collect();
-    joints_csv::write(&folder.join("joints.csv"), &frames, &positions)?;
-    let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
-    joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
-    let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
-    let source = Source { motion: file_name(&session.folder), model: model.name.clone(), model_hash: model.hash.clone() };
-    let mut files = Writer::new(folder, fit.shape(), Some(clip_from_rig), Order::ZXY, source);
-    files.motion(&Names::tracked(), &model.model.activity.to_string(), &clip)?;
-    files.finish()?;
-    style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
-    let report = folder.join("fit.json");
-    let names: Vec<ModelName> = models.iter().map(NamedModel::report_name).collect();
-    fit_json::write(&report, fit, observations, &names).with_context(|| report.display().to_string())
+    let motion = || -> Result<()> {
+        let (clip, clip_from_rig) = clip(fit, &session.rig, observations, session.fps)?;
+        let source = Source { motion: file_name(&session.folder), model: model.name.clone(), model_hash: model.hash.clone() };
+        let mut files = Writer::new(folder, fit.shape(), Some(clip_from_rig), Order::ZXY, source);
+        files.motion(&Names::tracked(), &model.model.activity.to_string(), &clip)?;
+        files.finish()
+    };
+    let numbers = || -> Result<()> {
+        joints_csv::write(&folder.join("joints.csv"), &frames, &positions)?;
+        let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
+        joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
+        style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
+        let report = folder.join("fit.json");
+        let names: Vec<ModelName> = models.iter().map(NamedModel::report_name).collect();
+        fit_json::write(&report, fit, observations, &names).with_context(|| report.display().to_string())
+    };
+    let (numbers, motion) = rayon::join(numbers, motion);
+    numbers.and(motion)
 }
 
 fn placements(fit: &Fit) -> Vec<Placement> {

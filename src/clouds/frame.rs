@@ -2,7 +2,7 @@
 
 use super::cloud::Cloud;
 use super::correlate::Region;
-use super::stage::{Change, Stage, StageOptions, changed_box, compare, person_mask, whole};
+use super::stage::{Change, Shade, Stage, StageOptions, changed_box, compare, person_mask, whole};
 use super::stereo::{StereoOptions, StereoView, ViewDisparity, match_views};
 use super::subpixel::{self, Other, Refined};
 use super::{edges, tidy, triangulate};
@@ -10,6 +10,7 @@ use crate::rig::Rig;
 use crate::rig::rectify::{Plane, Rectification, RectifiedView, RectifyError, groups};
 use image::{GrayImage, Luma};
 use nalgebra::Vector3;
+use rayon::prelude::*;
 
 /// Room around what changed, px: the reach of the correlation windows and of the outline's blur.
 const MARGIN_PX: usize = 12;
@@ -90,13 +91,14 @@ impl CloudRig {
     pub fn floor_m(&self, up: &Vector3<f64>) -> Option<f64> {
         let (rectification, stage) = self.groups.first()?;
         let matched = &stage.as_ref()?.views.first()?.matched;
-        let known = matched.enumerate_pixels().filter(|(u, v, d)| u % 2 == 0 && v % 2 == 0 && d.0[0] > 0.0);
-        let height = |(u, v, d): (u32, u32, &Luma<f32>)| {
-            let (u, v, d) = (u.into(), v.into(), d.0[0].into());
+        let height = |u: u32, v: u32| {
+            let d = f64::from(matched.get_pixel(u, v).0[0]);
+            let (u, v) = (u.into(), v.into());
             let per_px = rectification.world_jacobian(u, v, d).column(2).dot(up);
-            (rectification.world_from_pixel(u, v, d).dot(up), 1.0 / (per_px * per_px).max(1e-9))
+            (d > 0.0).then(|| (rectification.world_from_pixel(u, v, d).dot(up), 1.0 / (per_px * per_px).max(1e-9)))
         };
-        lowest_level(known.map(height).collect())
+        let of_row = |v: u32| (0..matched.width().div_ceil(2)).filter_map(move |half| height(2 * half, 2 * v));
+        lowest_level((0..matched.height().div_ceil(2)).into_par_iter().flat_map_iter(of_row).collect())
     }
 
     /// `stage_images` has one picture of the empty stage per camera of the rig.
@@ -131,7 +133,7 @@ const FLOOR_SHARE: f64 = 0.02;
 /// Level of the lowest slab of ±[`LEVEL_M`] that holds [`FLOOR_SHARE`] of the heights and more than the slab just above:
 /// the median there by the second numbers, the heights' precisions, so that the near floor decides.
 fn lowest_level(mut heights: Vec<(f64, f64)>) -> Option<f64> {
-    heights.sort_by(|a, b| a.0.total_cmp(&b.0));
+    heights.par_sort_by(|a, b| a.0.total_cmp(&b.0));
     let within = |centre: f64| {
         let from = heights.partition_point(|h| h.0 < centre - LEVEL_M);
         let to = heights.partition_point(|h| h.0 <= centre + LEVEL_M);
@@ -209,8 +211,10 @@ fn person(
     let mut changes: Vec<Change> = planes.iter().zip(&stage.views).map(|(now, stage)| compare(now, stage, &options.stage)).collect();
     let regions: Option<Vec<Region>> = changes.iter().map(|c| changed_box(&c.changed, &options.stage, MARGIN_PX)).collect();
     let Some(regions) = regions else { return nobody(rectification, cameras) };
+    let shade = |k: usize| Shade::new(&planes[k], &stage.views[k], &changes[k], regions[k], &options.stage);
+    let shades: Vec<Shade> = (0..planes.len()).map(shade).collect();
     let found = search(rectification, planes, &regions, range, options);
-    let outline = |k: usize| person_mask(rectification, k, regions[k], &changes, &stage.views[k], &found[k].1, &options.stage);
+    let outline = |k: usize| person_mask(rectification, k, (&changes, &shades), &stage.views[k], &found[k].1, &options.stage);
     let persons: Vec<GrayImage> = (0..found.len()).map(outline).collect();
     let refined = refine(&found, regions[0], Some(&persons[0]));
     let mut masks = vec![None; cameras];
@@ -336,10 +340,30 @@ fn confirmed_by_all(found: &[(StereoView, ViewDisparity)], region: Region, dispa
 }
 
 fn points(rectification: &Rectification, reference: &StereoView, refined: &Refined, region: Region, options: &CloudOptions) -> Cloud {
-    let cloud = tidy::remove_outliers(triangulate::triangulate(rectification, refined, region.corner(), &reference.plane));
+    let cloud = triangulate::triangulate(rectification, refined, region.corner(), &reference.plane);
+    let cloud = tidy::remove_outliers(cloud, neighbours(&refined.disparity));
     match options.voxel_m {
         Some(side) => tidy::thin(cloud, side),
         None => cloud,
+    }
+}
+
+/// For a point of a triangulated picture those of the pixels around it, where all have one.
+fn neighbours(disparity: &Plane) -> impl Fn(usize) -> Option<[usize; tidy::NEIGHBOURS]> {
+    /// The nearest twelve, x and y.
+    const AROUND: [[isize; 2]; tidy::NEIGHBOURS] =
+        [[0, -2], [-1, -1], [0, -1], [1, -1], [-2, 0], [-1, 0], [1, 0], [2, 0], [-1, 1], [0, 1], [1, 1], [0, 2]];
+    let width = disparity.width() as usize;
+    let pixels: Vec<usize> = triangulate::known(disparity).map(|(u, v, _)| v as usize * width + u as usize).collect();
+    let mut points = vec![None; disparity.as_raw().len()];
+    pixels.iter().enumerate().for_each(|(point, pixel)| points[*pixel] = Some(point));
+    move |point| {
+        let mut found = [0; tidy::NEIGHBOURS];
+        for (found, [x, y]) in found.iter_mut().zip(AROUND) {
+            // At the border a row's end meets the next one's beginning: far points, which prove nothing.
+            *found = (*points.get(pixels[point].checked_add_signed(x + y * width as isize)?)?)?;
+        }
+        Some(found)
     }
 }
 

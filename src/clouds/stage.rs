@@ -120,71 +120,87 @@ fn fill_line(values: &mut [f32], line: Vec<usize>) {
     }
 }
 
-/// How a rectified picture differs from the stage's.
+/// Where a rectified picture differs from the stage's.
 #[derive(Clone, Debug)]
 pub(crate) struct Change {
     /// Smoothed difference, grey levels.
     pub difference: Vec<f32>,
-    /// Smoothed logarithm of the ratio.
-    pub ratio: Vec<f32>,
     /// 255 where the difference exceeds its noise.
     pub changed: GrayImage,
-    /// The ratio smoothed over the size of a shadow's edge.
-    coarse: Vec<f32>,
-    /// How far the ratio is from that.
-    roughness: Vec<f32>,
-    /// Roughness of a shadow at most.
-    smooth: f32,
-    /// Step of a shadow's ratio between neighbours at most.
-    step: f32,
 }
 
-/// Compares a picture with the stage's. Most pixels must show the stage: the medians over the picture are taken for noise.
+/// Compares a picture with the stage's. Most pixels must show the stage: the median over the picture is taken for noise.
 pub(crate) fn compare(now: &Plane, stage: &StageView, options: &StageOptions) -> Change {
-    let width = now.width() as usize;
     let known = |i: usize| !(now.as_raw()[i] - stage.plane.as_raw()[i]).is_nan();
-    let or_0 = |v: f32| if v.is_nan() { 0.0 } else { v };
     let difference: Vec<f32> = now.iter().zip(stage.plane.iter()).map(|(a, b)| or_0(a - b)).collect();
-    let difference = blur(&difference, width, DIFFERENCE_SIGMA_PX);
+    let difference = blur(&difference, now.width() as usize, DIFFERENCE_SIGMA_PX);
     // 8-bit pictures have at least rounding noise.
     let noise = (1.4826 * median_over(difference.len(), known, |i| difference[i].abs())).max(0.5);
-    let ratio: Vec<f32> = now.iter().zip(&stage.logarithm).map(|(&a, b)| or_0(logarithm(a) - b)).collect();
-    let ratio = blur(&ratio, width, DIFFERENCE_SIGMA_PX);
-    let coarse = blur(&ratio, width, 2.0);
-    let squares: Vec<f32> = ratio.iter().zip(&coarse).map(|(r, c)| (r - c).powi(2)).collect();
-    let mut roughness = blur(&squares, width, 1.5);
-    roughness.iter_mut().for_each(|r| *r = r.sqrt());
-    let smooth = options.shade_roughness * median_over(roughness.len(), known, |i| roughness[i]);
-    let steps = ratio.len().saturating_sub(1);
-    let step = 4.0 * 1.4826 * median_over(steps, known, |i| (ratio[i] - ratio[i + 1]).abs());
     let changed = difference.iter().map(|d| if d.abs() > options.change_sigmas * noise { 255 } else { 0 }).collect();
     let changed = GrayImage::from_raw(now.width(), now.height(), changed).expect("one value per pixel");
-    Change { difference, ratio, changed, coarse, roughness, smooth, step }
+    Change { difference, changed }
 }
 
-impl Change {
-    /// Where in a region the grey values are a smooth fraction of the stage's, as in a cast shadow.
-    fn shaded(&self, region: Region) -> Vec<bool> {
-        let width = self.changed.width() as usize;
-        let shade = |i: usize| self.roughness[i] < self.smooth && self.coarse[i] < 0.0 && self.coarse[i] > DARKEST_SHADE;
-        let mut shaded: Vec<bool> = region.rows(width).flatten().map(shade).collect();
-        grow_shade(&mut shaded, &region.cut(&self.ratio, width), region.width(), self.step);
-        shaded
+#[inline]
+fn or_0(v: f32) -> f32 {
+    if v.is_nan() { 0.0 } else { v }
+}
+
+/// How much darker a part of a picture is than the stage.
+#[derive(Clone, Debug)]
+pub(crate) struct Shade {
+    region: Region,
+    /// Smoothed logarithm of the ratio.
+    ratio: Vec<f32>,
+    /// Where the grey values are a smooth fraction of the stage's, as in a cast shadow.
+    shaded: Vec<bool>,
+}
+
+impl Shade {
+    /// Of a region around what changed; what did not change in it tells the noise.
+    pub fn new(now: &Plane, stage: &StageView, change: &Change, region: Region, options: &StageOptions) -> Shade {
+        let (canvas, width) = (now.width() as usize, region.width());
+        let places: Vec<usize> = region.rows(canvas).flatten().collect();
+        let unchanged = |i: usize| {
+            let i = places[i];
+            change.changed.as_raw()[i] == 0 && !(now.as_raw()[i] - stage.plane.as_raw()[i]).is_nan()
+        };
+        let ratio = region.rows(canvas).flat_map(|row| now.as_raw()[row.clone()].iter().zip(&stage.logarithm[row]));
+        let ratio: Vec<f32> = ratio.map(|(&a, b)| or_0(logarithm(a) - b)).collect();
+        let ratio = blur(&ratio, width, DIFFERENCE_SIGMA_PX);
+        let coarse = blur(&ratio, width, 2.0);
+        let squares: Vec<f32> = ratio.iter().zip(&coarse).map(|(r, c)| (r - c).powi(2)).collect();
+        let mut roughness = blur(&squares, width, 1.5);
+        roughness.iter_mut().for_each(|r| *r = r.sqrt());
+        let smooth = options.shade_roughness * median_over(roughness.len(), unchanged, |i| roughness[i]);
+        let step = 4.0 * 1.4826 * median_over(ratio.len().saturating_sub(1), unchanged, |i| (ratio[i] - ratio[i + 1]).abs());
+        let shade = |(roughness, coarse): (&f32, &f32)| *roughness < smooth && *coarse < 0.0 && *coarse > DARKEST_SHADE;
+        let mut shaded: Vec<bool> = roughness.iter().zip(&coarse).map(shade).collect();
+        grow_shade(&mut shaded, &ratio, width, step);
+        Shade { region, ratio, shaded }
+    }
+
+    /// The ratio at a pixel of the canvas; outside of the region nothing changed.
+    fn ratio(&self, i: usize, canvas: usize) -> f32 {
+        self.region.place(i, canvas).map_or(0.0, |place| self.ratio[place])
     }
 }
 
 /// Roughness reaches a few pixels beyond an outline; there the shadow grows over small steps of the ratio.
 fn grow_shade(shaded: &mut [bool], ratio: &[f32], width: usize, largest_step: f32) {
-    let mut before = shaded.to_vec();
+    let inside = width..shaded.len().saturating_sub(width + 1);
+    let mut grown: Vec<usize> = (0..shaded.len()).filter(|i| shaded[*i]).collect();
     for _ in 0..GROWTH_PX {
-        before.copy_from_slice(shaded);
-        for i in width..shaded.len().saturating_sub(width + 1) {
-            if before[i] || ratio[i] >= 0.0 {
-                continue;
+        let mut next = Vec::new();
+        for j in grown {
+            for i in [j.wrapping_sub(1), j + 1, j.wrapping_sub(width), j + width] {
+                if inside.contains(&i) && !shaded[i] && ratio[i] < 0.0 && (ratio[i] - ratio[j]).abs() < largest_step {
+                    shaded[i] = true;
+                    next.push(i);
+                }
             }
-            let joins = |j: usize| before[j] && (ratio[i] - ratio[j]).abs() < largest_step;
-            shaded[i] = joins(i - 1) || joins(i + 1) || joins(i - width) || joins(i + width);
         }
+        grown = next;
     }
 }
 
@@ -237,26 +253,33 @@ pub(crate) fn changed_box(changed: &GrayImage, options: &StageOptions, margin: u
     found.map(|b| Region { x: grow(b.x, width), y: grow(b.y, height) })
 }
 
-/// Disparity difference of a distance in depth at the stage's disparity.
-fn clearance(rectification: &Rectification, stage_px: f32, distance_m: f64) -> f32 {
-    let depth = rectification.depth(f64::from(stage_px));
-    if depth > distance_m { (rectification.disparity(depth - distance_m) - f64::from(stage_px)) as f32 } else { f32::INFINITY }
+/// Whether a disparity is more than a distance nearer than the stage's, which it exceeds by `ahead_px`; false for NaN.
+fn nearer(rectification: &Rectification, stage_px: f32, ahead_px: f32, distance_m: f64) -> bool {
+    // With d = f b / z at the stage's depth z: ahead > f b / (z - distance) - d.
+    let [at, ahead] = [stage_px, ahead_px].map(f64::from);
+    let left = rectification.focal_px * rectification.baseline_m - distance_m * at;
+    left > 0.0 && ahead * left > distance_m * at * at
 }
 
-/// The person in `region` of rectified view `k`: 0/255. `changes` are those of all views.
+/// Whether a disparity stands clear of the stage's.
+fn clear(rectification: &Rectification, stage_px: f32, ahead_px: f32, options: &StageOptions) -> bool {
+    ahead_px > options.clearance_px && nearer(rectification, stage_px, ahead_px, options.clearance_m)
+}
+
+/// The person in rectified view `k`, in the region of its shade: 0/255. `changes` and `shades` are those of all views.
 pub(crate) fn person_mask(
     rectification: &Rectification,
     k: usize,
-    region: Region,
-    changes: &[Change],
+    (changes, shades): (&[Change], &[Shade]),
     stage: &StageView,
     found: &ViewDisparity,
     options: &StageOptions,
 ) -> GrayImage {
-    let canvas = rectification.size_px[0] as usize;
+    let (canvas, region) = (rectification.size_px[0] as usize, shades[k].region);
     let [disparity, ground] = [&found.disparity, &stage.disparity].map(|plane| region.cut(plane, canvas));
-    let places = region.rows(canvas).flatten().zip(changes[k].shaded(region));
-    let at = |((i, shaded), (d, stage)): ((usize, bool), (&f32, &f32))| label(rectification, k, i, changes, shaded, [*d, *stage], options);
+    let places = region.rows(canvas).flatten().zip(&shades[k].shaded);
+    let at =
+        |((i, shaded), (d, stage)): ((usize, &bool), (&f32, &f32))| label(rectification, k, i, (changes, shades), *shaded, [*d, *stage], options);
     let labels: Vec<Label> = places.zip(disparity.iter().zip(&ground)).map(at).collect();
     let sides = labels.iter().map(|label| match label {
         Label::Person => 1.0,
@@ -294,8 +317,8 @@ fn bridge(
     options: &StageOptions,
 ) -> GrayImage {
     let closed = regions::close(mask, BRIDGE_PX);
-    let before = |d: f32, stage: f32| d - stage > clearance(rectification, stage, options.clearance_m).max(options.clearance_px);
-    mask_of(region, |i| mask.as_raw()[i] != 0 || (closed.as_raw()[i] != 0 && before(disparity[i], stage[i])))
+    let before = |i: usize| clear(rectification, stage[i], disparity[i] - stage[i], options);
+    mask_of(region, |i| mask.as_raw()[i] != 0 || (closed.as_raw()[i] != 0 && before(i)))
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -311,29 +334,27 @@ fn label(
     rectification: &Rectification,
     k: usize,
     i: usize,
-    changes: &[Change],
+    (changes, shades): (&[Change], &[Shade]),
     shaded: bool,
     [disparity, stage_px]: [f32; 2],
     options: &StageOptions,
 ) -> Label {
     let changed = changes[k].changed.as_raw()[i] != 0;
-    let spread = if changed { ratio_spread(rectification, k, i, changes, stage_px) } else { None };
-    let shaded = match spread {
-        Some(spread) => changes[k].ratio[i] < 0.0 && (spread < SAME_RATIO || (shaded && spread < OTHER_RATIO)),
-        None => shaded,
+    let ahead = disparity - stage_px;
+    let at_stage = !stage_px.is_nan() && !clear(rectification, stage_px, ahead, options);
+    if !changed && (disparity.is_nan() || at_stage) {
+        return Label::Nothing;
+    }
+    let shaded = || {
+        let spread = if changed { ratio_spread(rectification, k, i, shades, stage_px) } else { None };
+        spread.map_or(shaded, |(ratio, spread)| ratio < 0.0 && (spread < SAME_RATIO || (shaded && spread < OTHER_RATIO)))
     };
     if disparity.is_nan() {
-        return match (changed, shaded) {
-            (true, false) => Label::Undecided,
-            (true, true) => Label::Stage,
-            _ => Label::Nothing,
-        };
+        return if shaded() { Label::Stage } else { Label::Undecided };
     }
-    let before = disparity - stage_px;
-    let needed = clearance(rectification, stage_px, options.clearance_m).max(options.clearance_px);
     // Windows at a foot's outline carry its depth over to the shadow beside it.
-    let beside_shadow = shaded && before < clearance(rectification, stage_px, options.shade_reach_m);
-    if !stage_px.is_nan() && (before <= needed || beside_shadow) {
+    let reached = || !stage_px.is_nan() && !nearer(rectification, stage_px, ahead, options.shade_reach_m);
+    if at_stage || (reached() && shaded()) {
         return if changed { Label::Stage } else { Label::Nothing };
     }
     let votes = (0..changes.len()).filter(|&j| j == k || changed_at(rectification, k, j, i, changes, disparity)).count();
@@ -348,12 +369,14 @@ const SAME_RATIO: f32 = 0.03;
 /// Farther apart than this (logarithm) even a smooth darkening is no shadow; smaller lets half hidden shadows pass for a person.
 const OTHER_RATIO: f32 = 0.1;
 
-/// Largest difference of the ratio between view `k` and where the others see the same place of the stage; `None` where no
+/// The ratio of view `k`, and its largest difference from where the others see the same place of the stage; `None` where no
 /// other view sees it.
-fn ratio_spread(rectification: &Rectification, k: usize, i: usize, changes: &[Change], stage_px: f32) -> Option<f32> {
-    let others = (0..changes.len()).filter(|&j| j != k);
-    let there = others.filter_map(|j| Some(changes[j].ratio[pixel_in(rectification, k, j, i, stage_px)?]));
-    there.map(|ratio| (ratio - changes[k].ratio[i]).abs()).reduce(f32::max)
+fn ratio_spread(rectification: &Rectification, k: usize, i: usize, shades: &[Shade], stage_px: f32) -> Option<(f32, f32)> {
+    let canvas = rectification.size_px[0] as usize;
+    let own = shades[k].ratio(i, canvas);
+    let others = (0..shades.len()).filter(|&j| j != k);
+    let there = others.filter_map(|j| Some(shades[j].ratio(pixel_in(rectification, k, j, i, stage_px)?, canvas)));
+    there.map(|ratio| (ratio - own).abs()).reduce(f32::max).map(|spread| (own, spread))
 }
 
 /// Whether view `j` shows a change where it sees pixel `i` of view `k` at this disparity.

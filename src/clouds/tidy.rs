@@ -2,7 +2,8 @@
 //!
 //! A point goes when the mean distance to its k nearest neighbours, in units of its own standard deviation, exceeds the
 //! cloud's median by more than c median deviations (PCL's statistical outlier filter, with the median for the mean, because a
-//! cloud of few points must not excuse its own outliers).
+//! cloud of few points must not excuse its own outliers). Any k points are at least as far on average as the k nearest: where
+//! those of the neighbouring pixels are near enough, nothing is searched.
 
 use super::cloud::{Cloud, CloudPoint};
 use crate::math::order::quantile;
@@ -11,7 +12,10 @@ use std::collections::BTreeMap;
 use std::num::NonZero;
 
 /// Neighbours that a point is judged by; fewer let pairs of outliers excuse each other.
-const NEIGHBOURS: usize = 12;
+pub const NEIGHBOURS: usize = 12;
+
+/// Points that the medians are taken over; more change nothing.
+const SAMPLED: usize = 1000;
 
 /// c: robust standard deviations of the neighbour distance.
 const OUTLIER_LIMIT: f64 = 6.0;
@@ -19,23 +23,34 @@ const OUTLIER_LIMIT: f64 = 6.0;
 /// Clouds of fewer points are not judged.
 const FEWEST_POINTS: usize = 50;
 
-/// The cloud without its lone points.
-pub fn remove_outliers(cloud: Cloud) -> Cloud {
+/// The cloud without its lone points. `beside` names points that are likely the nearest to one, where it can.
+pub fn remove_outliers(cloud: Cloud, beside: impl Fn(usize) -> Option<[usize; NEIGHBOURS]>) -> Cloud {
     let Some(first) = cloud.points.first().filter(|_| cloud.points.len() >= FEWEST_POINTS) else { return cloud };
     let places = places(&cloud, first);
     // More points than a bucket at one place make the tree refuse; such a cloud is left as it is.
     let Ok(tree) = ImmutableKdTree::<f32, 3>::new_from_slice(&places) else { return cloud };
     let wanted = NonZero::new(NEIGHBOURS + 1).unwrap_or(NonZero::<usize>::MIN);
-    let spread = |(point, at): (&CloudPoint, &[f32; 3])| {
-        let near = tree.query(at).nearest_n::<SquaredEuclidean<f32>>(wanted).execute();
-        let mean = near.iter().map(|n| f64::from(n.distance).sqrt()).sum::<f64>() / NEIGHBOURS as f64;
-        mean / point.covariance.trace().max(1e-12).sqrt()
+    let spread = |i: usize, squares: &mut dyn Iterator<Item = f32>| {
+        let mean = squares.map(|square| f64::from(square).sqrt()).sum::<f64>() / NEIGHBOURS as f64;
+        mean / cloud.points[i].covariance.trace().max(1e-12).sqrt()
     };
-    let spreads: Vec<f64> = cloud.points.iter().zip(&places).map(spread).collect();
-    let middle = median(spreads.clone());
-    let deviation = 1.4826 * median(spreads.iter().map(|s| (s - middle).abs()).collect());
+    let nearest = |i: usize| {
+        let near = tree.query(&places[i]).nearest_n::<SquaredEuclidean<f32>>(wanted).execute();
+        spread(i, &mut near.iter().map(|n| n.distance))
+    };
+    let step = (places.len() / SAMPLED).max(1);
+    let sampled: Vec<f64> = (0..places.len()).step_by(step).map(nearest).collect();
+    let middle = median(sampled.clone());
+    let deviation = 1.4826 * median(sampled.iter().map(|s| (s - middle).abs()).collect());
     let limit = middle + OUTLIER_LIMIT * deviation.max(0.15 * middle);
-    let mut points: Vec<CloudPoint> = cloud.points.into_iter().zip(spreads).filter(|(_, s)| *s <= limit).map(|(p, _)| p).collect();
+    let square = |i: usize, j: usize| (0..3).map(|k| (places[i][k] - places[j][k]).powi(2)).sum();
+    let stays = |i: usize| match (i % step, beside(i)) {
+        (0, _) => sampled[i / step] <= limit,
+        (_, Some(others)) if spread(i, &mut others.iter().map(|j| square(i, *j))) <= limit => true,
+        _ => nearest(i) <= limit,
+    };
+    let stay: Vec<bool> = (0..places.len()).map(stays).collect();
+    let mut points: Vec<CloudPoint> = cloud.points.into_iter().zip(stay).filter(|(_, stays)| *stays).map(|(p, _)| p).collect();
     // Clouds of all frames are kept.
     points.shrink_to_fit();
     Cloud { points }
@@ -85,9 +100,26 @@ mod tests {
 
     #[test]
     fn lone_points_go_and_the_sheet_stays() {
-        let kept = remove_outliers(sheet());
+        let kept = remove_outliers(sheet(), |_| None);
         assert_eq!(kept.points.len(), 900);
         assert!(kept.points.iter().all(|p| p.position.x < 0.5 && p.position.z < 0.1));
+    }
+
+    #[test]
+    fn neighbours_that_are_named_change_nothing() {
+        let (columns, rows) = (80, 60);
+        let depth = |i: usize| if i % 97 == 5 { 0.4 } else { 0.002 * (i * 7 % 5) as f64 };
+        let points = (0..columns * rows).map(|i| point((i % columns) as f64 * 0.01, (i / columns) as f64 * 0.01, depth(i)));
+        let cloud = Cloud { points: points.collect() };
+        let beside = |i: usize| {
+            let inside = (2..columns - 2).contains(&(i % columns)) && (2..rows - 2).contains(&(i / columns));
+            let near = (0..5 * 5).map(|k| (k % 5, k / 5)).filter(|(x, y)| (1..=4).contains(&(x.abs_diff(2) * x.abs_diff(2) + y.abs_diff(2) * y.abs_diff(2))));
+            let near: Vec<usize> = near.map(|(x, y)| i + x + y * columns - 2 - 2 * columns).take(NEIGHBOURS).collect();
+            if inside { near.try_into().ok() } else { None }
+        };
+        let (with, without) = (remove_outliers(cloud.clone(), beside), remove_outliers(cloud, |_| None));
+        assert!(without.points.len() < columns * rows && without.points.len() > columns * rows * 9 / 10);
+        assert_eq!(with, without);
     }
 
     #[test]

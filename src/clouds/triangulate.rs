@@ -17,7 +17,6 @@ const HALF_CONFIDENCE_PX: f64 = 0.1;
 
 /// Points of all known disparities of a part of the reference view whose first pixel is `corner`; `grey` is the whole picture.
 pub fn triangulate(rectification: &Rectification, refined: &Refined, corner: [usize; 2], grey: &Plane) -> Cloud {
-    let known = refined.disparity.enumerate_pixels().filter(|(_, _, d)| d.0[0] > 0.0);
     let point = |(u, v, d): (u32, u32, &image::Luma<f32>)| {
         let sigma_px = f64::from(refined.sigma_px.get_pixel(u, v).0[0]);
         let [u, v] = [u + corner[0] as u32, v + corner[1] as u32];
@@ -30,7 +29,12 @@ pub fn triangulate(rectification: &Rectification, refined: &Refined, corner: [us
             covariance: covariance(rectification, at, sigma_px),
         }
     };
-    Cloud { points: known.map(point).collect() }
+    Cloud { points: known(&refined.disparity).map(point).collect() }
+}
+
+/// The pixels that become points, in their order.
+pub fn known(disparity: &Plane) -> impl Iterator<Item = (u32, u32, &image::Luma<f32>)> {
+    disparity.enumerate_pixels().filter(|(_, _, d)| d.0[0] > 0.0)
 }
 
 /// Equation (1).

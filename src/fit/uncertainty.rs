@@ -121,7 +121,8 @@ impl Inverse {
     fn of(normal: &NormalEquations) -> Option<Inverse> {
         let factor = normal.local.cholesky()?;
         let eliminated = factor.solve(&normal.border);
-        let shared = (&normal.shared - normal.border.tr_mul(&eliminated)).cholesky()?.inverse();
+        // A product with a transposed copy runs in blocks, `tr_mul` does not.
+        let shared = (&normal.shared - normal.border.transpose() * &eliminated).cholesky()?.inverse();
         Some(Inverse { factor, eliminated, shared })
     }
 
@@ -156,10 +157,14 @@ fn propagate(
     curve: &Curve,
     state: &State,
 ) -> Option<(DMatrix<f64>, Vec<FrameUncertainty>)> {
-    let [way, way_shared] = Inverse::of(normal)?.way(pulls);
-    let [less, more] = [-STEP, STEP].map(|h| Inverse::of(&normal.plus(h, scores)));
-    let (less, more) = (less?, more?);
-    let (band_less, band_more) = rayon::join(|| less.factor.selected_inverse(), || more.factor.selected_inverse());
+    let selected = |h: f64| {
+        let inverse = Inverse::of(&normal.plus(h, scores))?;
+        let band = inverse.factor.selected_inverse();
+        Some((inverse, band))
+    };
+    let (ways, (less, more)) =
+        rayon::join(|| Some(Inverse::of(normal)?.way(pulls)), || rayon::join(|| selected(-STEP), || selected(STEP)));
+    let ([way, way_shared], (less, band_less), (more, band_more)) = (ways?, less?, more?);
     let surface = Surface::new(&state.shape);
     let layout = state.layout();
     let of_frame = |t: usize| {

@@ -83,12 +83,13 @@ pub fn low_pass(period: &[f64], harmonics: usize) -> Vec<f64> {
     let n = period.len() as f64;
     let mean = period.iter().sum::<f64>() / n;
     let mut kept = vec![mean; period.len()];
+    let turns: Vec<(f64, f64)> = (0..period.len()).map(|i| (TAU * i as f64 / n).sin_cos()).collect();
     for k in 1..=harmonics {
-        let angle = |i: usize| TAU * (k * i % period.len()) as f64 / n;
-        let a = period.iter().enumerate().map(|(i, y)| y * angle(i).cos()).sum::<f64>() * 2.0 / n;
-        let b = period.iter().enumerate().map(|(i, y)| y * angle(i).sin()).sum::<f64>() * 2.0 / n;
+        let turn = |i: usize| turns[k * i % period.len()];
+        let a = period.iter().enumerate().map(|(i, y)| y * turn(i).1).sum::<f64>() * 2.0 / n;
+        let b = period.iter().enumerate().map(|(i, y)| y * turn(i).0).sum::<f64>() * 2.0 / n;
         for (i, y) in kept.iter_mut().enumerate() {
-            *y += a * angle(i).cos() + b * angle(i).sin();
+            *y += a * turn(i).1 + b * turn(i).0;
         }
     }
     kept

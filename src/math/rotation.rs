@@ -44,7 +44,8 @@ pub fn mean(rotations: &[UnitQuaternion<f64>]) -> Option<UnitQuaternion<f64>> {
     for _ in 0..50 {
         let step = rotations.iter().map(|q| log(&(mean.inverse() * q))).sum::<Vector3<f64>>() / rotations.len() as f64;
         mean = UnitQuaternion::new_normalize((mean * exp(&step)).into_inner());
-        if step.norm() < 1e-12 {
+        // The next one would be smaller by the square of the spread.
+        if step.norm() < 1e-10 {
             break;
         }
     }

@@ -83,6 +83,13 @@ impl Region {
         [self.x[0], self.y[0]]
     }
 
+    /// Where in the region, row by row, pixel `i` of a picture of this width is; `None` outside.
+    pub fn place(&self, i: usize, width: usize) -> Option<usize> {
+        let (x, y) = (i % width, i / width);
+        let inside = (self.x[0]..self.x[1]).contains(&x) && (self.y[0]..self.y[1]).contains(&y);
+        inside.then(|| (y - self.y[0]) * self.width() + x - self.x[0])
+    }
+
     /// Where its rows lie in a picture of this width.
     pub fn rows(&self, width: usize) -> impl Iterator<Item = Range<usize>> {
         let [from, to] = self.x;

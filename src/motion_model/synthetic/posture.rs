@@ -131,16 +131,13 @@ impl Angles {
     /// Sole points of one side relative to the root.
     pub fn sole(&self, s: usize, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> Sole {
         let (side, names) = (&self.sides[s], &SIDES[s]);
-        let tilted = list(side.leg_lateral);
-        // The leg is flat up to the ankle, so angles add up.
-        let thigh = self.tilt - side.hip_flexion;
-        let bone = |length: f64, angle: f64| {
-            let (sin, cos) = angle.sin_cos();
-            Vector3::new(0.0, -length * cos, -length * sin)
-        };
+        let leg = self.leg_plane(s);
+        let bone = |length: f64, (sin, cos): (f64, f64)| Vector3::new(0.0, -length * cos, -length * sin);
         let (knee, ankle) = (-offsets[names.knee as usize].y, -offsets[names.ankle as usize].y);
-        let at_ankle = side.hip + tilted * (bone(knee, thigh) + bone(ankle, thigh + side.knee));
-        let rotation = self.carrier_from_foot(s);
+        let [w, x] = [leg.shank.w, leg.shank.i];
+        let shank = (2.0 * w * x, w * w - x * x);
+        let at_ankle = side.hip + leg.tilted * (bone(knee, (self.tilt - side.hip_flexion).sin_cos()) + bone(ankle, shank));
+        let rotation = self.carrier_from_foot(s, &leg);
         let at_ball = at_ankle + rotation * offsets[names.midtarsal as usize];
         [
             at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
@@ -149,17 +146,28 @@ impl Angles {
         ]
     }
 
-    fn carrier_from_foot(&self, s: usize) -> UnitQuaternion<f64> {
+    /// The leg is flat up to the ankle, so angles add up.
+    fn leg_plane(&self, s: usize) -> LegPlane {
+        let side = &self.sides[s];
+        LegPlane { tilted: list(side.leg_lateral), shank: pitch(self.tilt - side.hip_flexion + side.knee) }
+    }
+
+    fn carrier_from_foot(&self, s: usize, leg: &LegPlane) -> UnitQuaternion<f64> {
         let side = &self.sides[s];
         let sign = if s == 0 { 1.0 } else { -1.0 };
-        let (tilted, out) = (list(side.leg_lateral), yaw(sign * side.toe_out));
-        tilted * pitch(self.tilt - side.hip_flexion + side.knee) * tilted.inverse() * out * pitch(-side.ankle)
+        leg.tilted * leg.shank * leg.tilted.inverse() * yaw(sign * side.toe_out) * pitch(-side.ankle)
     }
 
     /// Pitch of the foot of one side, toes up positive.
     pub fn foot_pitch(&self, s: usize) -> f64 {
-        (self.carrier_from_foot(s) * Vector3::z()).y.asin()
+        (self.carrier_from_foot(s, &self.leg_plane(s)) * Vector3::z()).y.asin()
     }
+}
+
+/// The plane of a leg against the vertical, and the shank in it.
+struct LegPlane {
+    tilted: UnitQuaternion<f64>,
+    shank: UnitQuaternion<f64>,
 }
 
 /// Where the sole of a foot with its ankle at the origin is, metres.

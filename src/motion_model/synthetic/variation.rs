@@ -192,11 +192,12 @@ impl Variation {
 
 /// Adds one cycle's own harmonics, a quarter of the spread between people.
 pub(super) fn add_cycle_noise(tracks: &mut Tracks, rng: &mut ChaCha12Rng) {
+    let turns: Vec<(f64, f64)> = (0..tracks.len()).map(|i| (TAU * phase(i)).sin_cos()).collect();
     for channel in Channel::ALL {
         for side in 0..if channel.is_of_a_side() { 2 } else { 1 } {
             let own = harmonics(4, 0.25 * channel.spread_deg(), rng);
-            for (i, sample) in tracks.iter_mut().enumerate() {
-                sample[track(channel, side)] += harmonic_sum(&own, phase(i));
+            for (sample, turn) in tracks.iter_mut().zip(&turns) {
+                sample[track(channel, side)] += turned_sum(&own, *turn);
             }
         }
     }
@@ -213,11 +214,17 @@ fn harmonics(count: usize, spread: f64, rng: &mut ChaCha12Rng) -> Vec<[f64; 2]> 
 }
 
 fn harmonic_sum(harmonics: &[[f64; 2]], phase: f64) -> f64 {
-    let term = |(k, [a, b]): (usize, &[f64; 2])| {
-        let (sin, cos) = (TAU * (k + 1) as f64 * phase).sin_cos();
-        a * cos + b * sin
+    turned_sum(harmonics, (TAU * phase).sin_cos())
+}
+
+/// [`harmonic_sum`] from sine and cosine of the first harmonic's angle.
+fn turned_sum(harmonics: &[[f64; 2]], (sin, cos): (f64, f64)) -> f64 {
+    let (mut s, mut c) = (0.0, 1.0);
+    let term = |[a, b]: &[f64; 2]| {
+        (s, c) = (s * cos + c * sin, c * cos - s * sin);
+        a * c + b * s
     };
-    harmonics.iter().enumerate().map(term).sum()
+    harmonics.iter().map(term).sum()
 }
 
 /// Numbers of one subject's body (`None`) or of its way of doing one activity.
