@@ -93,9 +93,11 @@ impl CloudRig {
         let matched = &stage.as_ref()?.views.first()?.matched;
         let height = |u: u32, v: u32| {
             let d = f64::from(matched.get_pixel(u, v).0[0]);
-            let (u, v) = (u.into(), v.into());
-            let per_px = rectification.world_jacobian(u, v, d).column(2).dot(up);
-            (d > 0.0).then(|| (rectification.world_from_pixel(u, v, d).dot(up), 1.0 / (per_px * per_px).max(1e-9)))
+            (d > 0.0).then(|| {
+                let (u, v) = (u.into(), v.into());
+                let per_px = rectification.world_jacobian(u, v, d).column(2).dot(up);
+                (rectification.world_from_pixel(u, v, d).dot(up), 1.0 / (per_px * per_px).max(1e-9))
+            })
         };
         let of_row = |v: u32| (0..matched.width().div_ceil(2)).filter_map(move |half| height(2 * half, 2 * v));
         lowest_level((0..matched.height().div_ceil(2)).into_par_iter().flat_map_iter(of_row).collect())

@@ -160,13 +160,14 @@ impl Shade {
     /// Of a region around what changed; what did not change in it tells the noise.
     pub fn new(now: &Plane, stage: &StageView, change: &Change, region: Region, options: &StageOptions) -> Shade {
         let (canvas, width) = (now.width() as usize, region.width());
-        let places: Vec<usize> = region.rows(canvas).flatten().collect();
-        let unchanged = |i: usize| {
-            let i = places[i];
+        let unchanged = |place: usize| {
+            let i = (region.y[0] + place / width) * canvas + region.x[0] + place % width;
             change.changed.as_raw()[i] == 0 && !(now.as_raw()[i] - stage.plane.as_raw()[i]).is_nan()
         };
-        let ratio = region.rows(canvas).flat_map(|row| now.as_raw()[row.clone()].iter().zip(&stage.logarithm[row]));
-        let ratio: Vec<f32> = ratio.map(|(&a, b)| or_0(logarithm(a) - b)).collect();
+        let mut ratio = region.cut(now, canvas);
+        for (out, row) in ratio.chunks_exact_mut(width).zip(region.rows(canvas)) {
+            out.iter_mut().zip(&stage.logarithm[row]).for_each(|(a, b)| *a = or_0(logarithm(*a) - b));
+        }
         let ratio = blur(&ratio, width, DIFFERENCE_SIGMA_PX);
         let coarse = blur(&ratio, width, 2.0);
         let squares: Vec<f32> = ratio.iter().zip(&coarse).map(|(r, c)| (r - c).powi(2)).collect();
@@ -189,12 +190,15 @@ impl Shade {
 /// Roughness reaches a few pixels beyond an outline; there the shadow grows over small steps of the ratio.
 fn grow_shade(shaded: &mut [bool], ratio: &[f32], width: usize, largest_step: f32) {
     let inside = width..shaded.len().saturating_sub(width + 1);
-    let mut grown: Vec<usize> = (0..shaded.len()).filter(|i| shaded[*i]).collect();
-    for _ in 0..GROWTH_PX {
+    let small = |i: usize, j: usize| (ratio[i] - ratio[j]).abs() < largest_step;
+    let joins = |i: &usize| !shaded[*i] && ratio[*i] < 0.0 && around(*i, width).into_iter().any(|j| shaded[j] && small(*i, j));
+    let mut grown: Vec<usize> = inside.clone().filter(joins).collect();
+    grown.iter().for_each(|i| shaded[*i] = true);
+    for _ in 1..GROWTH_PX {
         let mut next = Vec::new();
         for j in grown {
-            for i in [j.wrapping_sub(1), j + 1, j.wrapping_sub(width), j + width] {
-                if inside.contains(&i) && !shaded[i] && ratio[i] < 0.0 && (ratio[i] - ratio[j]).abs() < largest_step {
+            for i in around(j, width).into_iter().filter(|i| inside.contains(i)) {
+                if !shaded[i] && ratio[i] < 0.0 && small(i, j) {
                     shaded[i] = true;
                     next.push(i);
                 }
@@ -202,6 +206,11 @@ fn grow_shade(shaded: &mut [bool], ratio: &[f32], width: usize, largest_step: f3
         }
         grown = next;
     }
+}
+
+/// The four neighbours of a pixel that is neither in the first row nor in the last.
+fn around(i: usize, width: usize) -> [usize; 4] {
+    [i - 1, i + 1, i - width, i + width]
 }
 
 /// The reach of the roughness measure.
@@ -277,10 +286,12 @@ pub(crate) fn person_mask(
 ) -> GrayImage {
     let (canvas, region) = (rectification.size_px[0] as usize, shades[k].region);
     let [disparity, ground] = [&found.disparity, &stage.disparity].map(|plane| region.cut(plane, canvas));
-    let places = region.rows(canvas).flatten().zip(&shades[k].shaded);
-    let at =
-        |((i, shaded), (d, stage)): ((usize, &bool), (&f32, &f32))| label(rectification, k, i, (changes, shades), *shaded, [*d, *stage], options);
-    let labels: Vec<Label> = places.zip(disparity.iter().zip(&ground)).map(at).collect();
+    let mut labels = Vec::with_capacity(disparity.len());
+    for i in region.rows(canvas).flatten() {
+        let place = labels.len();
+        let (shaded, disparities) = (shades[k].shaded[place], [disparity[place], ground[place]]);
+        labels.push(label(rectification, k, i, (changes, shades), shaded, disparities, options));
+    }
     let sides = labels.iter().map(|label| match label {
         Label::Person => 1.0,
         Label::Stage => -1.0,

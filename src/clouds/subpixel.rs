@@ -114,9 +114,13 @@ pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed:
     let weights = window_weights();
     let here = |other: &Other| slopes(reference, &now, other.step);
     let here: Vec<Vec<f32>> = others.iter().map(here).collect();
+    let known: Vec<usize> = (0..now.len()).filter(|i| !now[*i].is_nan()).collect();
     for _ in 0..ROUNDS {
         let planes = windows::planes(&now, width as usize, SAME_SURFACE_PX);
-        let look = |(k, other): (usize, &Other)| look_along(reference, &here[k], other, &planes, confirmed, 1 << k);
+        let look = |(k, other): (usize, &Other)| {
+            let confirmed = known.par_iter().copied().filter(|i| confirmed[*i] >> k & 1 != 0);
+            look_along(reference, &here[k], other, &planes, confirmed)
+        };
         let seen: Vec<View> = others.iter().enumerate().map(look).collect();
         let sums = windows::sums(&planes, width as usize, &seen, &weights, SAME_SURFACE_PX);
         for (i, sums) in sums.iter().enumerate() {
@@ -157,22 +161,19 @@ fn slopes(reference: &Plane, disparity: &[f32], step: Vector2<f32>) -> Vec<f32> 
     })
 }
 
-/// The other view where it sees the surface; NaN where it does not confirm it. `here` are the reference's own derivatives.
-fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], confirmed: &[u8], bit: u8) -> View {
-    let width = reference.width() as usize;
-    let one = |(i, &d): (usize, &f32)| {
-        if d.is_nan() || confirmed[i] & bit == 0 {
-            return (f32::NAN, [f32::NAN; 2]);
-        }
-        let (x, y) = ((i % width) as f32, (i / width) as f32);
+/// The other view where it sees the surface, for the pixels that it confirms. `here` are the reference's own derivatives.
+fn look_along(reference: &Plane, here: &[f32], other: &Other, planes: &[f32], confirmed: impl ParallelIterator<Item = usize>) -> View {
+    let [width, height] = [reference.width(), reference.height()].map(|s| s as usize);
+    let one = |i: usize| {
+        let (x, y, d) = ((i % width) as f32, (i / width) as f32, planes[i]);
         let there = |d: f32| other.see(x, y, d);
-        (there(d), [there(d + 0.5) - there(d - 0.5), here[i]])
+        (i, there(d), there(d + 0.5) - there(d - 0.5))
     };
-    let samples: Vec<(f32, [f32; 2])> = planes.par_iter().enumerate().map(one).collect();
-    let (gain, offset) = exposure(samples.iter().zip(reference.iter()).map(|(s, r)| (*r, s.0)));
-    let slopes: Vec<f32> = samples.iter().map(|(_, [there, here])| 0.5 * (there / gain + here)).collect();
-    let misfits: Vec<f32> = samples.iter().zip(reference.iter()).map(|(s, grey)| (s.0 - offset) / gain - grey).collect();
-    View::new(&slopes, &misfits, width)
+    let samples: Vec<(usize, f32, f32)> = confirmed.map(one).collect();
+    let grey = reference.as_raw();
+    let (gain, offset) = exposure(samples.iter().map(|(i, there, _)| (grey[*i], *there)));
+    let seen = |(i, there, slope): &(usize, f32, f32)| (*i, 0.5 * (slope / gain + here[*i]), (there - offset) / gain - grey[*i]);
+    View::new([width, height], samples.iter().map(seen))
 }
 
 /// Gain and offset of (reference, other) pairs of grey values, from their means and spreads; NaN pairs do not count.

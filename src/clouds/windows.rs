@@ -36,12 +36,17 @@ struct Padded {
 
 impl Padded {
     fn new(values: &[f32], width: usize, border: f32) -> Padded {
-        let (height, stride) = (values.len() / width.max(1), width.next_multiple_of(LANES) + 2 * RADIUS);
-        let mut padded = vec![border; (height + 2 * RADIUS) * stride];
-        for (out, row) in padded[RADIUS * stride..].chunks_exact_mut(stride).zip(values.chunks_exact(width.max(1))) {
+        let mut padded = Padded::filled(width, values.len() / width.max(1), border);
+        let stride = padded.stride;
+        for (out, row) in padded.values[RADIUS * stride..].chunks_exact_mut(stride).zip(values.chunks_exact(width.max(1))) {
             out[RADIUS..][..width].copy_from_slice(row);
         }
-        Padded { values: padded, stride }
+        padded
+    }
+
+    fn filled(width: usize, height: usize, value: f32) -> Padded {
+        let stride = width.next_multiple_of(LANES) + 2 * RADIUS;
+        Padded { values: vec![value; (height + 2 * RADIUS) * stride], stride }
     }
 
     /// The block that lies `dx` and `dy`, 0 to 2 [`RADIUS`], from the upper left of the window of that at (x, y).
@@ -59,14 +64,14 @@ pub struct View {
 }
 
 impl View {
-    /// From g and e per pixel, NaN where unknown.
-    pub fn new(slopes: &[f32], misfits: &[f32], width: usize) -> View {
-        let known: Vec<f32> = slopes.iter().zip(misfits).map(|(g, e)| if (g + e).is_nan() { 0.0 } else { 1.0 }).collect();
-        let of = |values: &[f32]| -> Padded {
-            let values: Vec<f32> = values.iter().zip(&known).map(|(v, known)| if *known > 0.0 { *v } else { 0.0 }).collect();
-            Padded::new(&values, width, 0.0)
-        };
-        View { slope: of(slopes), misfit: of(misfits), known: of(&known) }
+    /// Of a picture of `width` × `height` pixels: index, g and e of those that are seen; what is NaN is unknown.
+    pub fn new([width, height]: [usize; 2], seen: impl Iterator<Item = (usize, f32, f32)>) -> View {
+        let [mut slope, mut misfit, mut known] = [(); 3].map(|()| Padded::filled(width, height, 0.0));
+        for (i, g, e) in seen.filter(|(_, g, e)| !(g + e).is_nan()) {
+            let at = (i / width + RADIUS) * slope.stride + i % width + RADIUS;
+            (slope.values[at], misfit.values[at], known.values[at]) = (g, e, 1.0);
+        }
+        View { slope, misfit, known }
     }
 }
 
@@ -249,7 +254,8 @@ mod tests {
             (0..planes.len()).map(|i| if i % hole == 0 { f32::NAN } else { (a * i as f32).sin() }).collect()
         };
         let views = [[wave(0.7, 13), wave(1.9, 17)], [wave(0.3, 5), wave(2.3, 29)]];
-        let prepared = [0, 1].map(|k: usize| View::new(&views[k][0], &views[k][1], WIDTH));
+        let seen = |k: usize| (0..planes.len()).map(move |i| (i, k)).map(|(i, k)| (i, views[k][0][i], views[k][1][i]));
+        let prepared = [0, 1].map(|k| View::new([WIDTH, planes.len() / WIDTH], seen(k)));
         let weights: Weights = std::array::from_fn(|y| std::array::from_fn(|x| 1.0 / (1.0 + (x + 2 * y) as f32)));
         for (i, found) in sums(&planes, WIDTH, &prepared, &weights, SAME_PX).into_iter().enumerate() {
             let mut expected = Sums::default();

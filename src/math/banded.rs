@@ -89,13 +89,21 @@ impl BandCholesky {
         let mut z = BandMatrix::zeros(l.size, l.bandwidth);
         for j in (0..l.size).rev() {
             let last = (j + l.bandwidth).min(l.size - 1);
-            let column: Vec<f64> = (j..=last).map(|k| l.rows[l.index(k, j)]).collect();
-            for i in (j..=last).rev() {
-                let known: f64 = (j + 1..=last).map(|k| column[k - j] * z.get(k, i)).sum();
-                let unit = if i == j { 1.0 / column[0] } else { 0.0 };
-                let at = z.index(i, j);
-                z.rows[at] = (unit - known) / column[0];
+            let (column, diagonal): (Vec<f64>, f64) = ((j + 1..=last).map(|k| l.rows[l.index(k, j)]).collect(), l.rows[l.index(j, j)]);
+            // Σ L_kj Z_ki for all i > j: rows are read in their order, each for both triangles.
+            let mut known = vec![0.0; column.len()];
+            for (k, own) in column.iter().enumerate() {
+                let row = &z.rows[z.index(j + 1 + k, j + 1)..][..=k];
+                known[k] += dot(row, &column[..=k]);
+                known[..k].iter_mut().zip(row).for_each(|(sum, entry)| *sum += own * entry);
             }
+            for (k, known) in known.iter_mut().enumerate() {
+                let at = z.index(j + 1 + k, j);
+                *known = -*known / diagonal;
+                z.rows[at] = *known;
+            }
+            let at = z.index(j, j);
+            z.rows[at] = (1.0 / diagonal - dot(&column, &known)) / diagonal;
         }
         z
     }
