@@ -116,10 +116,6 @@ impl Grid {
         grid
     }
 
-    fn index(&self, [i, j, k]: [usize; 3]) -> usize {
-        (k * self.counts[1] + j) * self.counts[0] + i
-    }
-
     fn place(&self, index: usize) -> [usize; 3] {
         [index % self.counts[0], index / self.counts[0] % self.counts[1], index / self.counts[0] / self.counts[1]]
     }
@@ -133,19 +129,19 @@ impl Grid {
         let (mut vertices, mut quads) = (Vec::new(), Vec::new());
         let mut vertex_of_cell = vec![u32::MAX; self.values.len()];
         for (index, cell) in vertex_of_cell.iter_mut().enumerate() {
-            if let Some(vertex) = self.crossing(self.place(index)) {
+            if let Some(vertex) = self.crossing(index) {
                 *cell = vertices.len() as u32;
                 vertices.push(vertex);
             }
         }
         for (index, value) in self.values.iter().enumerate() {
-            let at = self.place(index);
             for axis in 0..3 {
-                let (b, c) = ((axis + 1) % 3, (axis + 2) % 3);
-                if at[axis] + 1 >= self.counts[axis] || at[b] == 0 || at[c] == 0 {
+                let Some(next) = self.values.get(index + self.stride(axis)) else { continue };
+                if (*value < 0.0) == (*next < 0.0) {
                     continue;
                 }
-                if (*value < 0.0) == (self.values[index + self.stride(axis)] < 0.0) {
+                let (at, b, c) = (self.place(index), (axis + 1) % 3, (axis + 2) % 3);
+                if at[axis] + 1 >= self.counts[axis] || at[b] == 0 || at[c] == 0 {
                     continue;
                 }
                 let (b, c) = (self.stride(b), self.stride(c));
@@ -163,13 +159,16 @@ impl Grid {
         [1, self.counts[0], self.counts[0] * self.counts[1]][axis]
     }
 
-    /// Mean of the crossings on the twelve edges of the cell from `at`.
-    fn crossing(&self, at: [usize; 3]) -> Option<Vector3<f64>> {
+    /// Mean of the crossings on the twelve edges of the cell from point `index`.
+    fn crossing(&self, index: usize) -> Option<Vector3<f64>> {
+        let offset = |n: usize| (n & 1) + (n >> 1 & 1) * self.stride(1) + (n >> 2) * self.stride(2);
+        let values: [f64; 8] = self.values.get(index..=index + offset(7)).map(|near| std::array::from_fn(|n| near[offset(n)]))?;
+        let inside = values.iter().filter(|v| **v < 0.0).count();
+        let at = if inside % 8 == 0 { return None } else { self.place(index) };
         if (0..3).any(|k| at[k] + 1 >= self.counts[k]) {
             return None;
         }
         let corner = |n: usize| [at[0] + (n & 1), at[1] + (n >> 1 & 1), at[2] + (n >> 2)];
-        let values: [f64; 8] = std::array::from_fn(|n| self.values[self.index(corner(n))]);
         let (mut sum, mut count) = (Vector3::zeros(), 0.0);
         for from in 0..8usize {
             for to in [from | 1, from | 2, from | 4].into_iter().filter(|to| *to != from) {

@@ -23,25 +23,25 @@ pub struct Pca {
 
 /// PCA of the columns of `examples` (D×M). Without columns everything is empty.
 pub fn pca(examples: &DMatrix<f64>) -> Pca {
-    with(examples, |eigenvalues| eigenvalues.len())
+    with(&mut examples.clone(), |eigenvalues| eigenvalues.len())
 }
 
-/// The same with no more of the leading components than hold `part` (0 to 1) of the variance.
-pub fn leading(examples: &DMatrix<f64>, part: f64) -> Pca {
+/// The same with no more of the leading components than hold `part` (0 to 1) of the variance; leaves the examples without their mean.
+pub fn leading(examples: &mut DMatrix<f64>, part: f64) -> Pca {
     with(examples, |eigenvalues| components(eigenvalues, part))
 }
 
-fn with(examples: &DMatrix<f64>, count: impl Fn(&[f64]) -> usize) -> Pca {
-    let (d, m) = examples.shape();
+fn with(centred: &mut DMatrix<f64>, count: impl Fn(&[f64]) -> usize) -> Pca {
+    let (d, m) = centred.shape();
     if m == 0 {
         return Pca { mean: DVector::zeros(d), basis: DMatrix::zeros(d, 0), eigenvalues: Vec::new() };
     }
-    let mean = examples.column_mean();
-    let mut centred = examples.clone();
+    let mean = centred.column_mean();
     centred.column_iter_mut().for_each(|mut column| column -= &mean);
+    let centred = &*centred;
     // A product with a transposed copy runs in blocks, `tr_mul` does not.
     let few = m <= d;
-    let products = if few { centred.transpose() * &centred } else { &centred * centred.transpose() };
+    let products = if few { centred.transpose() * centred } else { centred * centred.transpose() };
     let eigen = (products / m as f64).symmetric_eigen();
     let mut order: Vec<usize> = (0..m.min(d)).collect();
     order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
@@ -50,7 +50,7 @@ fn with(examples: &DMatrix<f64>, count: impl Fn(&[f64]) -> usize) -> Pca {
     let real = eigenvalues.iter().take_while(|&&l| l > NULL_SPACE * eigenvalues[0]).count();
     let kept = real.min(count(&eigenvalues));
     let vectors = eigen.eigenvectors.select_columns(&order[..kept]);
-    let mut basis = if few { &centred * vectors } else { vectors };
+    let mut basis = if few { centred * vectors } else { vectors };
     for mut component in basis.column_iter_mut() {
         let sign = if component[component.iamax()] < 0.0 { -1.0 } else { 1.0 };
         component *= sign / component.norm();
@@ -116,7 +116,7 @@ mod tests {
     #[test]
     fn leading_components_are_the_first_of_all() {
         let x = examples(40, 9);
-        let (all, some) = (pca(&x), leading(&x, 0.9));
+        let (all, some) = (pca(&x), leading(&mut x.clone(), 0.9));
         let count = components(&all.eigenvalues, 0.9);
         assert!(count > 1 && count < all.basis.ncols());
         assert_eq!((&some.eigenvalues, &some.mean), (&all.eigenvalues, &all.mean));

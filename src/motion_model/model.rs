@@ -108,17 +108,15 @@ impl Model {
         if members.len() < 2 {
             return Err(ModelError::TooFew(members.len()));
         }
-        let vectors = DMatrix::from_columns(&members.iter().map(|m| m.vector.clone()).collect::<Vec<_>>());
-        let Pca { mean, basis, eigenvalues } = pca::leading(&vectors, STORED_VARIANCE);
+        let mut centred = columns(&members, |m| &m.vector);
+        let Pca { mean, basis, eigenvalues } = pca::leading(&mut centred, STORED_VARIANCE);
         if basis.is_empty() {
             return Err(ModelError::NoVariance);
         }
-        let roots = DMatrix::from_columns(&members.iter().map(|m| m.root.clone()).collect::<Vec<_>>());
+        let roots = columns(&members, |m| &m.root);
         let root_mean = roots.column_mean();
         // A product with a transposed copy runs in blocks, `tr_mul` does not.
-        let mut weights = basis.transpose() * &vectors;
-        let mean_weights = basis.tr_mul(&mean);
-        weights.column_iter_mut().for_each(|mut w| w -= &mean_weights);
+        let weights = basis.transpose() * centred;
         let root_basis = root_loadings(&roots, &root_mean, &weights);
         Ok(Model { activity, synthetic, mean_rotations, mean, basis, eigenvalues, root_mean, root_basis, members })
     }
@@ -318,6 +316,14 @@ fn vector_of(mean_rotations: &[UnitQuaternion<f64>; BALL_JOINTS], cycle: &Cycle)
 pub fn root_of(cycle: &Cycle) -> DVector<f64> {
     let channels = cycle.root.iter().flat_map(|s| [s.rotation.x, s.rotation.y, s.rotation.z, s.position.x, s.position.y, s.position.z]);
     DVector::from_iterator(SAMPLES * ROOT_CHANNELS, channels)
+}
+
+/// Vectors of all members, of which there is one at least, as columns.
+fn columns(members: &[Member], of: impl Fn(&Member) -> &DVector<f64>) -> DMatrix<f64> {
+    let length = of(&members[0]).len();
+    let mut all = Vec::with_capacity(members.len() * length);
+    members.iter().for_each(|m| all.extend_from_slice(of(m).as_slice()));
+    DMatrix::from_vec(length, members.len(), all)
 }
 
 /// Equation (6); `weights` is components x members with mean zero.

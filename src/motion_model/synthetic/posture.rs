@@ -130,44 +130,67 @@ impl Angles {
 
     /// Sole points of one side relative to the root.
     pub fn sole(&self, s: usize, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> Sole {
-        let (side, names) = (&self.sides[s], &SIDES[s]);
-        let leg = self.leg_plane(s);
-        let bone = |length: f64, (sin, cos): (f64, f64)| Vector3::new(0.0, -length * cos, -length * sin);
-        let (knee, ankle) = (-offsets[names.knee as usize].y, -offsets[names.ankle as usize].y);
-        let [w, x] = [leg.shank.w, leg.shank.i];
-        let shank = (2.0 * w * x, w * w - x * x);
-        let at_ankle = side.hip + leg.tilted * (bone(knee, (self.tilt - side.hip_flexion).sin_cos()) + bone(ankle, shank));
-        let rotation = self.carrier_from_foot(s, &leg);
-        let at_ball = at_ankle + rotation * offsets[names.midtarsal as usize];
-        [
-            at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
-            at_ball + rotation * (Vector3::new(0.0, -BALL_HEIGHT, 0.0) * stature_m),
-            at_ball + rotation * (pitch(-side.toe) * (Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD) * stature_m)),
-        ]
-    }
-
-    /// The leg is flat up to the ankle, so angles add up.
-    fn leg_plane(&self, s: usize) -> LegPlane {
-        let side = &self.sides[s];
-        LegPlane { tilted: list(side.leg_lateral), shank: pitch(self.tilt - side.hip_flexion + side.knee) }
-    }
-
-    fn carrier_from_foot(&self, s: usize, leg: &LegPlane) -> UnitQuaternion<f64> {
-        let side = &self.sides[s];
-        let sign = if s == 0 { 1.0 } else { -1.0 };
-        leg.tilted * leg.shank * leg.tilted.inverse() * yaw(sign * side.toe_out) * pitch(-side.ankle)
+        self.lower_leg(s).sole(offsets, stature_m)
     }
 
     /// Pitch of the foot of one side, toes up positive.
     pub fn foot_pitch(&self, s: usize) -> f64 {
-        (self.carrier_from_foot(s, &self.leg_plane(s)) * Vector3::z()).y.asin()
+        self.lower_leg(s).foot_pitch()
+    }
+
+    /// One leg from the knee down. The leg is flat up to the ankle, so angles add up.
+    pub fn lower_leg(&self, s: usize) -> LowerLeg {
+        let side = self.sides[s];
+        let sign = if s == 0 { 1.0 } else { -1.0 };
+        let thigh = self.tilt - side.hip_flexion;
+        let foot = yaw(sign * side.toe_out) * pitch(-side.ankle);
+        LowerLeg { side, names: &SIDES[s], thigh, tilted: list(side.leg_lateral), shank: pitch(thigh + side.knee), foot }
     }
 }
 
-/// The plane of a leg against the vertical, and the shank in it.
-struct LegPlane {
+/// A leg's turns, of which many soles can be made.
+pub(super) struct LowerLeg {
+    side: Side,
+    names: &'static SideJoints,
+    /// Angle against the vertical, radians.
+    thigh: f64,
+    /// The leg's plane against the vertical, and the shank in it.
     tilted: UnitQuaternion<f64>,
     shank: UnitQuaternion<f64>,
+    /// Of the foot against the plane.
+    foot: UnitQuaternion<f64>,
+}
+
+impl LowerLeg {
+    /// Puts the plane elsewhere, see [`Side::leg_lateral`].
+    pub fn tilt(&mut self, leg_lateral: f64) {
+        self.tilted = list(leg_lateral);
+    }
+
+    /// Sole points relative to the root.
+    pub fn sole(&self, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> Sole {
+        let bone = |length: f64, (sin, cos): (f64, f64)| Vector3::new(0.0, -length * cos, -length * sin);
+        let (knee, ankle) = (-offsets[self.names.knee as usize].y, -offsets[self.names.ankle as usize].y);
+        let [w, x] = [self.shank.w, self.shank.i];
+        let shank = (2.0 * w * x, w * w - x * x);
+        let at_ankle = self.side.hip + self.tilted * (bone(knee, self.thigh.sin_cos()) + bone(ankle, shank));
+        let rotation = self.carrier_from_foot();
+        let at_ball = at_ankle + rotation * offsets[self.names.midtarsal as usize];
+        [
+            at_ankle + rotation * (Vector3::new(0.0, -ANKLE_HEIGHT, -HEEL_BACK) * stature_m),
+            at_ball + rotation * (Vector3::new(0.0, -BALL_HEIGHT, 0.0) * stature_m),
+            at_ball + rotation * (pitch(-self.side.toe) * (Vector3::new(0.0, -BALL_HEIGHT, TOE_FORWARD) * stature_m)),
+        ]
+    }
+
+    fn carrier_from_foot(&self) -> UnitQuaternion<f64> {
+        self.tilted * self.shank * self.tilted.inverse() * self.foot
+    }
+
+    /// Toes up positive.
+    pub fn foot_pitch(&self) -> f64 {
+        (self.carrier_from_foot() * Vector3::z()).y.asin()
+    }
 }
 
 /// Where the sole of a foot with its ankle at the origin is, metres.

@@ -336,13 +336,15 @@ fn angles(subject: &SyntheticSubject, tracks: &Tracks, gait: &Gait, gain: f64, l
             angles.sides[side].toe_out = -mean[track(Channel::HipRotation, side)].to_radians();
             let adduction = sample[track(Channel::HipAdduction, side)] - mean[track(Channel::HipAdduction, side)];
             let foot_x = sign * 0.5 * gait.step_width * subject.step_width - (gait.sway)(phase(i)) - sign * 0.1 * adduction.to_radians();
+            let mut leg = angles.lower_leg(side);
             for _ in 0..2 {
-                let [heel, _, toe] = subject.sole(&angles, side);
+                let [heel, _, toe] = leg.sole(&subject.offsets, subject.stature_m);
                 angles.sides[side].leg_lateral += foot_x - 0.5 * (heel.x + toe.x) / subject.hip_height_m;
+                leg.tilt(angles.sides[side].leg_lateral);
             }
             let t = own_phase(i, side);
             let flat = smooth_step(gait.laid_flat.0, gait.laid_flat.1, t) * (1.0 - smooth_step(gait.heel_rises.0, gait.heel_rises.1, t));
-            angles.sides[side].ankle -= flat * angles.foot_pitch(side);
+            angles.sides[side].ankle -= flat * leg.foot_pitch();
             bend_toes(&mut angles, side, t, gait);
         }
         angles
