@@ -29,10 +29,11 @@ pub fn behind(reference: &Plane, others: &[Other], disparity: &Plane) -> Plane {
     let width = disparity.width() as usize;
     let values = disparity.as_raw();
     let farthest = extremes(values, width, REACH_PX, f32::min);
+    let places = nearest_first();
     let one = |i: usize| {
         let near = values[i];
         let beside = farthest[i] < near - JUMP_PX;
-        let Some(far) = beside.then(|| far_side(values, width, i)).flatten() else { return near };
+        let Some(far) = beside.then(|| far_side(values, width, i, &places)).flatten() else { return near };
         let [there, here] = [far, near].map(|d| cost(reference, others, i, d));
         match there < CLEARLY * here {
             true => far,
@@ -44,11 +45,21 @@ pub fn behind(reference: &Plane, others: &[Other], disparity: &Plane) -> Plane {
     Plane::from_raw(disparity.width(), disparity.height(), moved).expect("one value per pixel")
 }
 
+/// Offsets x and y of up to [`REACH_PX`].
+fn nearest_first() -> Vec<[isize; 2]> {
+    let reach = REACH_PX as isize;
+    let mut places: Vec<[isize; 2]> = (-reach..=reach).flat_map(|y| (-reach..=reach).map(move |x| [x, y])).collect();
+    places.sort_by_key(|[x, y]| x * x + y * y);
+    places
+}
+
 /// Disparity of the nearest pixel on a farther surface.
-fn far_side(disparity: &[f32], width: usize, i: usize) -> Option<f32> {
+fn far_side(disparity: &[f32], width: usize, i: usize, places: &[[isize; 2]]) -> Option<f32> {
     let below = disparity[i] - JUMP_PX;
-    let farther = around(i, REACH_PX as isize, width, disparity.len()).filter(|(_, _, j)| disparity[*j] < below);
-    farther.min_by_key(|(dx, dy, _)| dx * dx + dy * dy).map(|(_, _, j)| disparity[j])
+    let (x, y) = (i % width, i / width);
+    let place = |[dx, dy]: &[isize; 2]| Some((x.checked_add_signed(*dx)?, y.checked_add_signed(*dy)?));
+    let inside = places.iter().filter_map(place).filter(|(x, y)| *x < width && y * width < disparity.len());
+    inside.map(|(x, y)| disparity[y * width + x]).find(|d| *d < below)
 }
 
 /// c of (1).

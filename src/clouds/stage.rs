@@ -24,7 +24,8 @@ pub struct StageOptions {
     pub clearance_m: f64,
     /// Smallest difference in disparity from the stage, px; about three times the matching noise.
     pub clearance_px: f32,
-    /// Roughness of the ratio to the stage, in units of its median over the picture, below which a darkening counts as a shadow.
+    /// Roughness of the ratio to the stage, in units of its median where nothing changed around the person, below which a darkening
+    /// counts as a shadow.
     pub shade_roughness: f32,
     /// Shadows reach this far behind the person where windows blur depths, metres.
     pub shade_reach_m: f64,
@@ -428,6 +429,42 @@ fn trim_outline(mask: &mut GrayImage, difference: &[f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rig::rectify::rectify;
+    use crate::rig::rectify::tests::random_rig;
+    use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+
+    #[test]
+    fn shade_grows_as_when_every_pixel_is_asked_in_every_round() {
+        let (width, height, step) = (41, 29, 0.3);
+        let wave = |i: usize| (0.7 * i as f32).sin() * (0.13 * (i * i) as f32).cos();
+        let ratio: Vec<f32> = (0..width * height).map(|i| wave(i) - 0.2).collect();
+        let seeds: Vec<bool> = (0..width * height).map(|i| i * 7919 % 23 == 0).collect();
+        let mut expected = seeds.clone();
+        for _ in 0..GROWTH_PX {
+            let before = expected.clone();
+            for i in (width..width * (height - 1) - 1).filter(|i| !before[*i] && ratio[*i] < 0.0) {
+                expected[i] = [i - 1, i + 1, i - width, i + width].iter().any(|j| before[*j] && (ratio[i] - ratio[*j]).abs() < step);
+            }
+        }
+        let mut found = seeds.clone();
+        grow_shade(&mut found, &ratio, width, step);
+        let count = |shaded: &[bool]| shaded.iter().filter(|s| **s).count();
+        assert!(found == expected && count(&found) > 2 * count(&seeds), "{} {} {}", count(&seeds), count(&found), count(&expected));
+    }
+
+    #[test]
+    fn nearer_is_nearer_in_depth() {
+        let mut random = ChaCha8Rng::seed_from_u64(7);
+        let rectification = rectify(&random_rig(&mut random, false), &[0, 1, 2]).unwrap();
+        for (depth, distance) in [(4.0, 0.02), (4.0, 0.3), (0.9, 0.5)] {
+            let at = rectification.disparity(depth);
+            let needed = rectification.disparity(depth - distance) - at;
+            let beyond = |part: f64| nearer(&rectification, at as f32, (part * needed) as f32, distance);
+            assert!(beyond(1.001) && !beyond(0.999), "{depth} {distance}");
+        }
+        assert!(!nearer(&rectification, rectification.disparity(0.4) as f32, 1e6, 0.5));
+        assert!(!nearer(&rectification, f32::NAN, 9.0, 0.1) && !nearer(&rectification, 9.0, f32::NAN, 0.1));
+    }
 
     #[test]
     fn logarithms_meet_the_library() {

@@ -123,8 +123,8 @@ pub fn refine(reference: &Plane, others: &[Other], disparity: &Plane, confirmed:
         };
         let seen: Vec<View> = others.iter().enumerate().map(look).collect();
         let sums = windows::sums(&planes, width as usize, &seen, &weights, SAME_SURFACE_PX);
-        for (i, sums) in sums.iter().enumerate() {
-            if let Some(fit) = sums.and_then(fit).filter(|f| f.step.abs() < LONGEST_STEP_PX) {
+        for &i in &known {
+            if let Some(fit) = sums[i].and_then(fit).filter(|f| f.step.abs() < LONGEST_STEP_PX) {
                 now[i] = planes[i] + fit.step;
                 fits[i] = Some(fit);
             }

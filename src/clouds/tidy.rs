@@ -107,14 +107,14 @@ mod tests {
 
     #[test]
     fn neighbours_that_are_named_change_nothing() {
-        let (columns, rows) = (80, 60);
+        let (columns, rows) = (80usize, 60);
         let depth = |i: usize| if i % 97 == 5 { 0.4 } else { 0.002 * (i * 7 % 5) as f64 };
         let points = (0..columns * rows).map(|i| point((i % columns) as f64 * 0.01, (i / columns) as f64 * 0.01, depth(i)));
         let cloud = Cloud { points: points.collect() };
+        let around = || (-2isize..=2).flat_map(|y| (-2isize..=2).map(move |x| (x, y))).filter(|(x, y)| (1..=4).contains(&(x * x + y * y)));
         let beside = |i: usize| {
             let inside = (2..columns - 2).contains(&(i % columns)) && (2..rows - 2).contains(&(i / columns));
-            let near = (0..5 * 5).map(|k| (k % 5, k / 5)).filter(|(x, y)| (1..=4).contains(&(x.abs_diff(2) * x.abs_diff(2) + y.abs_diff(2) * y.abs_diff(2))));
-            let near: Vec<usize> = near.map(|(x, y)| i + x + y * columns - 2 - 2 * columns).take(NEIGHBOURS).collect();
+            let near: Vec<usize> = around().filter_map(|(x, y)| i.checked_add_signed(x + y * columns as isize)).collect();
             if inside { near.try_into().ok() } else { None }
         };
         let (with, without) = (remove_outliers(cloud.clone(), beside), remove_outliers(cloud, |_| None));

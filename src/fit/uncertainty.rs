@@ -162,8 +162,7 @@ fn propagate(
         let band = inverse.factor.selected_inverse();
         Some((inverse, band))
     };
-    let (ways, (less, more)) =
-        rayon::join(|| Some(Inverse::of(normal)?.way(pulls)), || rayon::join(|| selected(-STEP), || selected(STEP)));
+    let (ways, (less, more)) = rayon::join(|| Some(Inverse::of(normal)?.way(pulls)), || rayon::join(|| selected(-STEP), || selected(STEP)));
     let ([way, way_shared], (less, band_less), (more, band_more)) = (ways?, less?, more?);
     let surface = Surface::new(&state.shape);
     let layout = state.layout();
