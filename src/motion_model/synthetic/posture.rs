@@ -143,8 +143,8 @@ impl Angles {
         let side = self.sides[s];
         let sign = if s == 0 { 1.0 } else { -1.0 };
         let thigh = self.tilt - side.hip_flexion;
-        let foot = yaw(sign * side.toe_out) * pitch(-side.ankle);
-        LowerLeg { side, names: &SIDES[s], thigh, tilted: list(side.leg_lateral), shank: pitch(thigh + side.knee), foot }
+        let (tilted, shank) = (list(side.leg_lateral), pitch(thigh + side.knee));
+        LowerLeg { side, names: &SIDES[s], thigh, tilted, shank, out: yaw(sign * side.toe_out), ankle: pitch(-side.ankle) }
     }
 }
 
@@ -158,7 +158,8 @@ pub(super) struct LowerLeg {
     tilted: UnitQuaternion<f64>,
     shank: UnitQuaternion<f64>,
     /// Of the foot against the plane.
-    foot: UnitQuaternion<f64>,
+    out: UnitQuaternion<f64>,
+    ankle: UnitQuaternion<f64>,
 }
 
 impl LowerLeg {
@@ -169,11 +170,12 @@ impl LowerLeg {
 
     /// Sole points relative to the root.
     pub fn sole(&self, offsets: &[Vector3<f64>; NODES], stature_m: f64) -> Sole {
-        let bone = |length: f64, (sin, cos): (f64, f64)| Vector3::new(0.0, -length * cos, -length * sin);
+        let bone = |length: f64, angle: f64| {
+            let (sin, cos) = angle.sin_cos();
+            Vector3::new(0.0, -length * cos, -length * sin)
+        };
         let (knee, ankle) = (-offsets[self.names.knee as usize].y, -offsets[self.names.ankle as usize].y);
-        let [w, x] = [self.shank.w, self.shank.i];
-        let shank = (2.0 * w * x, w * w - x * x);
-        let at_ankle = self.side.hip + self.tilted * (bone(knee, self.thigh.sin_cos()) + bone(ankle, shank));
+        let at_ankle = self.side.hip + self.tilted * (bone(knee, self.thigh) + bone(ankle, self.thigh + self.side.knee));
         let rotation = self.carrier_from_foot();
         let at_ball = at_ankle + rotation * offsets[self.names.midtarsal as usize];
         [
@@ -184,7 +186,7 @@ impl LowerLeg {
     }
 
     fn carrier_from_foot(&self) -> UnitQuaternion<f64> {
-        self.tilted * self.shank * self.tilted.inverse() * self.foot
+        self.tilted * self.shank * self.tilted.inverse() * self.out * self.ankle
     }
 
     /// Toes up positive.

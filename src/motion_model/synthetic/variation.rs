@@ -190,14 +190,16 @@ impl Variation {
     }
 }
 
+const NOISE_HARMONICS: usize = 4;
+
 /// Adds one cycle's own harmonics, a quarter of the spread between people.
 pub(super) fn add_cycle_noise(tracks: &mut Tracks, rng: &mut ChaCha12Rng) {
-    let turns: Vec<(f64, f64)> = (0..tracks.len()).map(|i| (TAU * phase(i)).sin_cos()).collect();
+    let turns: Vec<_> = (0..tracks.len()).map(|i| turns(NOISE_HARMONICS, phase(i))).collect();
     for channel in Channel::ALL {
         for side in 0..if channel.is_of_a_side() { 2 } else { 1 } {
-            let own = harmonics(4, 0.25 * channel.spread_deg(), rng);
-            for (sample, turn) in tracks.iter_mut().zip(&turns) {
-                sample[track(channel, side)] += turned_sum(&own, *turn);
+            let own = harmonics(NOISE_HARMONICS, 0.25 * channel.spread_deg(), rng);
+            for (sample, turns) in tracks.iter_mut().zip(&turns) {
+                sample[track(channel, side)] += turned_sum(&own, turns);
             }
         }
     }
@@ -214,17 +216,16 @@ fn harmonics(count: usize, spread: f64, rng: &mut ChaCha12Rng) -> Vec<[f64; 2]> 
 }
 
 fn harmonic_sum(harmonics: &[[f64; 2]], phase: f64) -> f64 {
-    turned_sum(harmonics, (TAU * phase).sin_cos())
+    turned_sum(harmonics, &turns(harmonics.len(), phase))
 }
 
-/// [`harmonic_sum`] from sine and cosine of the first harmonic's angle.
-fn turned_sum(harmonics: &[[f64; 2]], (sin, cos): (f64, f64)) -> f64 {
-    let (mut s, mut c) = (0.0, 1.0);
-    let term = |[a, b]: &[f64; 2]| {
-        (s, c) = (s * cos + c * sin, c * cos - s * sin);
-        a * c + b * s
-    };
-    harmonics.iter().map(term).sum()
+/// Sine and cosine of the first harmonics' angles.
+fn turns(count: usize, phase: f64) -> Vec<(f64, f64)> {
+    (1..=count).map(|k| (TAU * k as f64 * phase).sin_cos()).collect()
+}
+
+fn turned_sum(harmonics: &[[f64; 2]], turns: &[(f64, f64)]) -> f64 {
+    harmonics.iter().zip(turns).map(|([a, b], (sin, cos))| a * cos + b * sin).sum()
 }
 
 /// Numbers of one subject's body (`None`) or of its way of doing one activity.
