@@ -121,7 +121,7 @@ fn styled(known: &Known, state: State, frames: &[Frame], ten: &Curve) -> State {
 }
 
 fn stage(free: Free, model_m: f64, refreshes: usize) -> Stage {
-    Stage { free, settings: rough(model_m), refreshes, least_fall: 1e-3 }
+    Stage { free, settings: rough(model_m), refreshes, least_change: 1e-3 }
 }
 
 /// Frames at least [`APART_S`] apart, the first and the last among them; all where that leaves fewer than [`FEWEST_FRAMES`].

@@ -163,16 +163,15 @@ struct Stage {
     free: Free,
     settings: Settings,
     refreshes: usize,
-    /// Ends after a round in which the cost falls by less than this part of it. Weights are frozen within a round: from round to round
-    /// they change, and with them the cost, which then may stay by chance while the body still moves.
-    least_fall: f64,
+    /// Ends where a round changes the cost by less than this part of it.
+    least_change: f64,
 }
 
-/// For stages that only lead to the next one: after more rounds of theirs the last one ends at the same place. With 0.01 a run came
-/// out 3 mm worse.
-const ROUGHLY: f64 = 5e-3;
-/// Where the last stage ends: with a third of it figures with known joints come out the same within 0.6 mm.
-const CLOSELY: f64 = 1e-3;
+/// For stages that only lead to the next one: after more rounds of theirs the last one ends at the same place. With 0.03 long jumps
+/// and fast runs come out 2 mm worse.
+const ROUGHLY: f64 = 1e-2;
+/// Larger ends up to half a degree early.
+const CLOSELY: f64 = 3e-4;
 
 const PLACED: Free = Free { rotation: false, phase: false, weights: false, stature: false, lengths: false, widths: false, posture: false };
 const TURNED: Free = Free { rotation: true, phase: true, ..PLACED };
@@ -187,8 +186,8 @@ pub struct Checkpoint {
     pub rounds: usize,
     /// Solver iterations in this stage.
     pub iterations: u64,
-    /// Part of the cost by which it fell in the last round; infinite before the first.
-    pub fall: f64,
+    /// At the beginning of the last round.
+    pub cost: f64,
     pub state: State,
 }
 
@@ -221,12 +220,15 @@ impl Run<'_> {
     /// Alternates frozen weights and one solver iteration; more iterations between two freezings take longer to the same cost.
     fn stage(&mut self, state: State, frames: &[Frame], curve: &Curve, stage: &Stage) -> State {
         let begun = (self.checkpoints.load)(self.stages);
-        let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, fall: f64::INFINITY, state });
-        while at.rounds < stage.refreshes && at.fall >= stage.least_fall {
+        let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, cost: f64::INFINITY, state });
+        while at.rounds < stage.refreshes {
             let problem = Problem::new(curve, frames, &stage.settings, stage.free, &self.known, &at.state);
+            let cost = total(&problem.fitness).cost + problem.prior_cost(&at.state);
+            if (at.cost - cost).abs() < stage.least_change * cost {
+                break;
+            }
             let (state, summary) = minimise(problem, at.state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
-            let fall = 1.0 - summary.final_cost / summary.initial_cost;
-            at = Checkpoint { rounds: at.rounds + 1, iterations: at.iterations + summary.iterations, fall, state };
+            at = Checkpoint { rounds: at.rounds + 1, iterations: at.iterations + summary.iterations, cost, state };
             (self.checkpoints.save)(self.stages, &at);
         }
         self.stages += 1;
@@ -295,14 +297,14 @@ pub fn resume(
     let shaped = if options.lengths { SHAPED } else { STYLED };
     let approach =
         Settings { at_skin: false, point_weight: 2.0 * settings.point_weight, ray_weight: 2.0 * settings.ray_weight, ..settings };
-    let approaching = |free, settings, refreshes| Stage { free, settings, refreshes, least_fall: ROUGHLY };
+    let approaching = |free, settings, refreshes| Stage { free, settings, refreshes, least_change: ROUGHLY };
     state = run.stage(state, &half, &ten, &approaching(STYLED, Settings { model_m: 0.03, ..approach }, 5));
     step(0.55)?;
     let curve = Curve::new(model, components);
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &half, &curve, &approaching(shaped, approach, 10));
     step(0.7)?;
-    let mut last = Stage { free: shaped, settings, refreshes: 10, least_fall: CLOSELY };
+    let mut last = Stage { free: shaped, settings, refreshes: 10, least_change: CLOSELY };
     if options.deviations {
         let posed = Stage { free: Free { lengths: options.lengths, ..POSED }, ..last };
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };

@@ -59,8 +59,7 @@ impl NormalEquations {
         let factor = local.cholesky()?;
         let eliminated = factor.solve(&self.border);
         let y_free = factor.solve(&DMatrix::from_column_slice(local.size(), 1, self.local_gradient.as_slice())).column(0).into_owned();
-        // A product with a transposed copy runs in blocks, `tr_mul` does not.
-        let schur = shared - self.border.transpose() * &eliminated;
+        let schur = shared - self.border.tr_mul(&eliminated);
         let z = schur.cholesky()?.solve(&(self.border.tr_mul(&y_free) - &self.shared_gradient));
         let y = -(y_free + eliminated * &z);
         Some((y, z))
