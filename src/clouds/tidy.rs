@@ -14,7 +14,7 @@ use std::num::NonZero;
 /// Neighbours that a point is judged by; fewer let pairs of outliers excuse each other.
 pub const NEIGHBOURS: usize = 12;
 
-/// Points that the medians are taken over; more change nothing.
+/// Points that the medians are taken over, about.
 const SAMPLED: usize = 1000;
 
 /// c: robust standard deviations of the neighbour distance.
