@@ -35,7 +35,7 @@ fn recorded_walkers_are_found_by_evidence() {
                 let weights: DVector<f64> = model.project(&vector).rows(0, COMPONENTS).into_owned();
                 let style = Style::of_weights(&model, "", &weights, knot.parameter, 0.9, 1.0);
                 let population = Population::new(&model, COMPONENTS);
-                let odds = identity::log_odds(&population, &model, &vector, knot.parameter).unwrap();
+                let odds = identity::recognise(&population, &model, &vector, knot.parameter).unwrap().odds;
                 let best = odds.iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
                 [style.neighbours[0].subject == subject, best.0 == subject, best.0 == subject && best.1 > 0.0]
             })
@@ -47,7 +47,8 @@ fn recorded_walkers_are_found_by_evidence() {
     let taken_for_another = |name: &&&str| {
         let (own, others): (Vec<Cycle>, Vec<Cycle>) = cycles.iter().cloned().partition(|c| c.subject == ***name);
         let model = Model::build(Activity::Walking, false, &others).unwrap();
-        let odds = identity::log_odds(&Population::new(&model, COMPONENTS), &model, &model.vector_of(&own[0]), own[0].parameter).unwrap();
+        let odds =
+            identity::recognise(&Population::new(&model, COMPONENTS), &model, &model.vector_of(&own[0]), own[0].parameter).unwrap().odds;
         odds.iter().any(|(_, odds)| *odds > 0.0)
     };
     println!("{} of {} strangers are taken for somebody", people.par_iter().filter(taken_for_another).count(), people.len());

@@ -283,7 +283,7 @@ pub fn style(fit: &Fit, model: &NamedModel) -> Style {
         rows.clone().map(|i| rows.clone().map(|j| fit.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, j)])).collect()).collect();
     let style = Style::of_weights(&model.model, &model.hash, &weights, fit.parameter(model.model.activity), hip_height, fit.cadence_hz);
     let style = Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style };
-    style.departing(own_motion::departure(fit, &model.model)).identified(&model.model)
+    style.departing(own_motion::departure(fit, &model.model)).expecting(&model.model)
 }
 
 /// The fitted poses in a y-up world, one per 1/fps second, dropped frames filled in; and the rotation into that world.
@@ -328,9 +328,9 @@ pub fn draw(folder: &Path, rig: &Rig, model: &NamedModel, tracked: &Tracked) -> 
     let title = format!("Cloud and body, frame {}", observations[middle].number);
     report::save(&folder.join("cloud.png"), &report::cloud_and_body(&dots, &placements[middle].positions, rig.up, &title)?)?;
     draw_curves(folder, tracked)?;
-    let covariance = fit.uncertainty.as_ref().map(|u| [[u.shared[(0, 0)], u.shared[(0, 1)]], [u.shared[(1, 0)], u.shared[(1, 1)]]]);
-    let known = covariance.filter(|_| fit.state.weights.len() > 1);
-    let picture = report::clusters(&model.model, &fit.state.weights, known, "This person among the model's subjects")?;
+    let style = style(fit, model);
+    let (weights, covariance) = style.place();
+    let picture = report::clusters(&model.model, weights, covariance, "This person among the model's subjects")?;
     Ok(report::save(&folder.join("weights.png"), &picture)?)
 }
 

@@ -193,7 +193,9 @@ pub(super) fn freeze_outsides(frame: &Frame, surface: &PosedSurface, settings: &
     let frozen = frame.outsides.iter().flat_map(|o| surface.primitives.iter().map(move |p| (o, p))).map(|(outside, p)| {
         let metres_per_px = outside.camera.camera_point(&p.centre).z / outside.camera.matrix[(0, 0)];
         let scaled = (outside_px(outside, &p.centre) * metres_per_px).powi(2) * precision / (OUTSIDE_CAUCHY * OUTSIDE_CAUCHY);
-        cost += settings.outside_weight * 0.5 * OUTSIDE_CAUCHY * OUTSIDE_CAUCHY * scaled.ln_1p();
+        if scaled > 0.0 {
+            cost += settings.outside_weight * 0.5 * OUTSIDE_CAUCHY * OUTSIDE_CAUCHY * scaled.ln_1p();
+        }
         FrozenOutside { weight: settings.outside_weight * precision / (1.0 + scaled), metres_per_px }
     });
     (frozen.collect(), cost)

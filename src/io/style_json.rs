@@ -42,7 +42,7 @@ pub fn write_style(path: &Path, style: &Style) -> Result<(), StyleFileError> {
 mod tests {
     use super::*;
     use crate::motion_model::Activity;
-    use crate::style::{Neighbour, Observation};
+    use crate::style::{Expected, Neighbour, Observation};
 
     #[test]
     fn comes_back_as_written_and_refuses_other_files() {
@@ -54,6 +54,7 @@ mod tests {
             weights: vec![0.1, -2.5e-3],
             covariance: Some(vec![vec![1e-4, 0.0], vec![0.0, 2e-4]]),
             cadence_factor: 1.02,
+            expected: Some(Expected { weights: vec![0.2, -1e-3], covariance: vec![vec![3e-4, 1e-5], vec![1e-5, 4e-4]] }),
             neighbours: vec![Neighbour {
                 subject: "12".into(),
                 distance: 0.3,

@@ -12,12 +12,14 @@ use crate::motion_model::Model;
 const ELLIPSE: f64 = 2.448;
 
 /// The first two weights of every cycle, a colour and a name per subject, and `weights` with its 95 % ellipse where
-/// `covariance` (2x2) is known; in units of the population's standard deviation.
-pub fn clusters(model: &Model, weights: &[f64], covariance: Option<[[f64; 2]; 2]>, title: &str) -> Result<RgbImage, ReportError> {
+/// `covariance` (rows) is known; in units of the population's standard deviation.
+pub fn clusters(model: &Model, weights: &[f64], covariance: Option<&Vec<Vec<f64>>>, title: &str) -> Result<RgbImage, ReportError> {
     let series = series(model);
     let scale = |i: usize| model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12));
     let person = units(model, weights);
-    let ring = covariance.map(|c| ellipse(person, [[0, 0], [0, 1], [1, 1]].map(|[i, j]| c[i][j] / scale(i) / scale(j))));
+    let entry = |i: usize, j: usize| Some(covariance?.get(i)?.get(j)? / scale(i) / scale(j)).filter(|v| v.is_finite());
+    let entries = entry(0, 0).zip(entry(0, 1)).zip(entry(1, 1));
+    let ring = entries.map(|((xx, xy), yy)| ellipse(person, [xx, xy, yy]));
     let found =
         Curve { label: String::new(), points: ring.clone().unwrap_or_else(|| vec![person]), dashed: false, colour: 0, band: Vec::new() };
     let all: Vec<Curve> = series.iter().cloned().chain([found]).collect();

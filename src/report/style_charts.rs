@@ -39,7 +39,7 @@ pub(super) fn section(model: &Model, style: &Style, uncertainty: &[f64]) -> Mark
     }
 }
 
-/// Figure 2: the first two weights of every cycle, with the person's and its 95 % ellipse.
+/// Figure 2: the first two weights of every cycle, with the person's and its 95 % ellipse; a tracked person's are the expected ones.
 pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
     let scales = [scale(model, 0), scale(model, 1)];
     let place = |w: &[f64]| [0, 1].map(|i| w.get(i).copied().unwrap_or(0.0) / scales[i]);
@@ -52,9 +52,14 @@ pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
         names.push(([0, 1].map(|a| points.iter().map(|p| p[a]).sum::<f64>() / n), subject.to_string()));
         dots.push(Dots { points, colour: k % INK, radius: 2.4, ..Dots::default() });
     }
-    let person = place(&style.weights);
+    if style.expected.is_some() {
+        let tracked = vec![place(&style.weights)];
+        dots.push(Dots { label: "the tracked motion".into(), points: tracked, colour: 6, radius: 4.0, ..Dots::default() });
+    }
+    let (person, covariance) = style.place();
+    let person = place(person);
     dots.push(Dots { label: "this person, 95 % ellipse".into(), points: vec![person], colour: INK, radius: 5.0, bars: Vec::new() });
-    let ring = style.covariance.as_ref().and_then(|c| {
+    let ring = covariance.and_then(|c| {
         let entry = |i: usize, j: usize| Some(c.get(i)?.get(j)? / scales[i] / scales[j]);
         Some(ellipse(person, [entry(0, 0)?, entry(0, 1)?, entry(1, 1)?]))
     });

@@ -7,10 +7,14 @@
 //! subjects the weights change with the parameter on average, β, and W the spread of all cycles about that; a stranger's
 //! are the population's N(0, Λ). For each subject
 //!   log odds = ln ∫ p(Ψ_J|α) p(α|subject) dα − ln ∫ p(Ψ_J|α) p(α|stranger) dα.                                       (2)
+//! With everybody in the database and a stranger equally likely beforehand the weights that recordings of the person would have are
+//!   E[α|Ψ_J] = Σ_k r_k α̂_k,   cov = Σ_k r_k (P_k⁻¹ + (α̂_k − E)(α̂_k − E)ᵀ),                                       (3)
+//! over subjects and stranger, r_k ∝ the odds, α̂_k and P_k mean and precision of p(α|Ψ_J, k).
 //! Departure: equation (6) of the style paper weighs a weight by its λ². The first weights of marker sets hold how wrists
-//! and heads were marked, so between a tracked person and recordings it compares what two skeletons do not share.
+//! and heads were marked, so between the weights of a tracked motion and recordings it compares what two skeletons do not share;
+//! between (3) and recordings it does not.
 //! Fails when nobody of the database has two cycles: then W is not known.
-//! Checked against the densities written out, and on people with cycles in the database and without.
+//! Checked against the densities written out and quadrature, and on people with cycles in the database and without.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -47,20 +51,46 @@ struct Information {
     pull: DVector<f64>,
 }
 
-/// Equation (2) for the subjects of the model, in the order of `population`, with `vector` the motion Ψ at `parameter`;
-/// `None` where W is not known.
-pub fn log_odds(population: &Population, model: &Model, vector: &DVector<f64>, parameter: f64) -> Option<Vec<(String, f64)>> {
+/// Who somebody is, by a motion.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Recognised {
+    /// Equation (2) for the subjects of the model, in the order of the population.
+    pub odds: Vec<(String, f64)>,
+    /// Equation (3): components, and components x components.
+    pub weights: DVector<f64>,
+    pub covariance: DMatrix<f64>,
+}
+
+/// Equations (2) and (3) with `vector` the motion Ψ at `parameter`; `None` where W is not known.
+pub fn recognise(population: &Population, model: &Model, vector: &DVector<f64>, parameter: f64) -> Option<Recognised> {
     let count = population.components();
     let information = information(model, vector, count);
     let subjects = Subjects::of(population, model)?;
     let stranger = DMatrix::from_diagonal(&DVector::from_column_slice(&population.eigenvalues));
-    let against = evidence(&information, &DVector::zeros(count), &stranger)?;
-    let of_subject = |(name, own): (&String, &Centre)| {
+    let stranger = believe(&information, &DVector::zeros(count), &stranger)?;
+    let of_subject = |own: &Centre| {
         let mean = &own.weights + &subjects.change * (parameter - own.parameter);
-        let found = evidence(&information, &mean, &(&subjects.spread * (1.0 + 1.0 / own.cycles)))?;
-        Some((name.clone(), found - against))
+        believe(&information, &mean, &(&subjects.spread * (1.0 + 1.0 / own.cycles)))
     };
-    subjects.names.iter().zip(&subjects.centres).map(of_subject).collect()
+    let known = subjects.centres.iter().map(of_subject).collect::<Option<Vec<Belief>>>()?;
+    let odds: Vec<f64> = known.iter().map(|k| k.evidence - stranger.evidence).collect();
+    let all: Vec<Belief> = known.into_iter().chain([stranger]).collect();
+    let (weights, covariance) = mixed(&all);
+    Some(Recognised { odds: subjects.names.into_iter().zip(odds).collect(), weights, covariance })
+}
+
+/// Equation (3).
+fn mixed(all: &[Belief]) -> (DVector<f64>, DMatrix<f64>) {
+    let most = all.iter().map(|k| k.evidence).fold(f64::NEG_INFINITY, f64::max);
+    let likely: Vec<f64> = all.iter().map(|k| (k.evidence - most).exp()).collect();
+    let share = |k: usize| likely[k] / likely.iter().sum::<f64>();
+    let weights = all.iter().enumerate().map(|(k, b)| &b.mean * share(k)).sum::<DVector<f64>>();
+    let about = |b: &Belief| {
+        let off = &b.mean - &weights;
+        &b.covariance + &off * off.transpose()
+    };
+    let covariance = all.iter().enumerate().map(|(k, b)| about(b) * share(k)).sum::<DMatrix<f64>>();
+    (weights, covariance)
 }
 
 /// The mean of one subject's cycles.
@@ -134,20 +164,32 @@ fn information(model: &Model, vector: &DVector<f64>, count: usize) -> Informatio
     found
 }
 
-/// ln ∫ exp(−½ αᵀ I α + bᵀ α) N(α; mean, covariance) dα; `None` where the covariance is singular.
-fn evidence(information: &Information, mean: &DVector<f64>, covariance: &DMatrix<f64>) -> Option<f64> {
+/// What is believed of the weights after seeing the motion, if the person is a certain one.
+struct Belief {
+    /// ln ∫ exp(−½ αᵀ I α + bᵀ α) p(α) dα.
+    evidence: f64,
+    /// α̂ and P⁻¹.
+    mean: DVector<f64>,
+    covariance: DMatrix<f64>,
+}
+
+/// With N(mean, covariance) for p(α); `None` where the covariance is singular.
+fn believe(information: &Information, mean: &DVector<f64>, covariance: &DMatrix<f64>) -> Option<Belief> {
     let prior = covariance.clone().cholesky()?;
     let pulled = prior.solve(mean);
     let posterior = (&information.precision + prior.inverse()).cholesky()?;
     let rhs = &information.pull + &pulled;
+    let found = posterior.solve(&rhs);
     let log_det = |l: DMatrix<f64>| 2.0 * l.diagonal().iter().map(|v| v.ln()).sum::<f64>();
-    Some(0.5 * (rhs.dot(&posterior.solve(&rhs)) - mean.dot(&pulled) - log_det(posterior.l()) - log_det(prior.l())))
+    let evidence = 0.5 * (rhs.dot(&found) - mean.dot(&pulled) - log_det(posterior.l()) - log_det(prior.l()));
+    Some(Belief { evidence, mean: found, covariance: posterior.inverse() })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::motion_model::{Activity, Cycle, synthetic};
+    use crate::style::Metric;
 
     #[test]
     fn evidence_is_that_of_the_densities_written_out() {
@@ -165,8 +207,37 @@ mod tests {
         };
         let (a, b) = (DVector::from_vec(vec![0.5, -0.8, 0.0, 1.0]), DVector::zeros(4));
         let (narrow, wide) = (spd(1.3) * 0.1, spd(0.4) * 5.0);
-        let found = evidence(&information, &a, &narrow).unwrap() - evidence(&information, &b, &wide).unwrap();
+        let [a_known, b_known] = [(&a, &narrow), (&b, &wide)].map(|(mean, covariance)| believe(&information, mean, covariance).unwrap());
+        let found = a_known.evidence - b_known.evidence;
         assert!((found - (density(&a, &narrow) - density(&b, &wide))).abs() < 1e-9);
+    }
+
+    #[test]
+    fn expected_weights_are_those_of_quadrature() {
+        let information =
+            Information { precision: DMatrix::from_row_slice(2, 2, &[1.4, -0.5, -0.5, 0.6]), pull: DVector::from_vec(vec![0.9, 0.3]) };
+        let priors = [
+            (DVector::from_vec(vec![1.5, -0.5]), DMatrix::from_row_slice(2, 2, &[0.2, 0.05, 0.05, 0.1])),
+            (DVector::from_vec(vec![-0.6, 1.1]), DMatrix::from_row_slice(2, 2, &[0.3, -0.1, -0.1, 0.4])),
+            (DVector::zeros(2), DMatrix::from_row_slice(2, 2, &[2.0, 0.0, 0.0, 1.0])),
+        ];
+        let (mut sum, mut first, mut second) = (0.0, DVector::zeros(2), DMatrix::zeros(2, 2));
+        for (i, k) in (-200..=200).flat_map(|i| (-200..=200).map(move |k| (i, k))) {
+            let x = DVector::from_vec(vec![0.04 * f64::from(i), 0.04 * f64::from(k)]);
+            let prior = priors.iter().map(|(mean, covariance)| {
+                let off = &x - mean;
+                (-0.5 * off.dot(&(covariance.clone().try_inverse().unwrap() * &off))).exp() / covariance.determinant().sqrt()
+            });
+            let share = (information.pull.dot(&x) - 0.5 * x.dot(&(&information.precision * &x))).exp() * prior.sum::<f64>();
+            sum += share;
+            first += &x * share;
+            second += &x * x.transpose() * share;
+        }
+        let first = first / sum;
+        let second = second / sum - &first * first.transpose();
+        let (weights, covariance) = mixed(&priors.map(|(mean, covariance)| believe(&information, &mean, &covariance).unwrap()));
+        assert!((&weights - &first).amax() < 1e-6, "{weights} {first}");
+        assert!((&covariance - &second).amax() < 1e-6, "{covariance} {second}");
     }
 
     #[test]
@@ -179,7 +250,7 @@ mod tests {
         let population = Population::new(&model, 12);
         let odds = |s: u64| {
             let vector = model.vector_of(&synthetic::subject(Activity::Walking, s).cycle(1.35, 7));
-            let mut found = log_odds(&population, &model, &vector, 1.35).unwrap();
+            let mut found = recognise(&population, &model, &vector, 1.35).unwrap().odds;
             found.sort_by(|a, b| b.1.total_cmp(&a.1));
             found
         };
@@ -197,9 +268,43 @@ mod tests {
     }
 
     #[test]
+    fn another_skeleton_does_not_move_a_person_away_from_the_own_recordings() {
+        let known = |s: u64| {
+            [0.9, 1.2, 1.5].into_iter().flat_map(move |v| (0..3).map(move |k| synthetic::subject(Activity::Walking, s).cycle(v, k)))
+        };
+        let cycles: Vec<Cycle> = (1..=9).flat_map(known).collect();
+        let model = Model::build(Activity::Walking, true, &cycles).unwrap();
+        let population = Population::new(&model, 12);
+        // Distances of the plain projection and of the expected weights from the person's own, by (6) and by Mahalanobis.
+        let distances = |s: u64| {
+            let vector = model.vector_of(&synthetic::subject(Activity::Walking, s).cycle(1.2, 7));
+            let own = model.project(&vector).rows(0, 12).into_owned();
+            let zero = |axis: usize| 0.2 * 2f64.sqrt() * (1.3 * s as f64 + 2.7 * axis as f64).sin();
+            let tracked = DVector::from_fn(vector.len(), |i, _| vector[i] + zero(i % DOF));
+            let plain = model.project(&tracked).rows(0, 12).into_owned();
+            let expected = recognise(&population, &model, &tracked, 1.2).unwrap().weights;
+            let nearest = population.neighbours(&model, &expected, 1.2).swap_remove(0).subject;
+            let far = |metric: Metric, weights: &DVector<f64>| metric.distance(&population.eigenvalues, weights, &own);
+            (nearest, [Metric::Paper, Metric::Mahalanobis].map(|m| [far(m, &plain), far(m, &expected)]))
+        };
+        for s in 1..=9 {
+            let (nearest, [paper, mahalanobis]) = distances(s);
+            println!("{s} {nearest} {paper:?} {mahalanobis:?}");
+            assert!(nearest == cycles[9 * (s as usize - 1)].subject, "{s}: {nearest}");
+            assert!(paper[1] < 0.5 * paper[0] && mahalanobis[1] < 0.5 * mahalanobis[0], "{s}: {paper:?} {mahalanobis:?}");
+        }
+        let strangers: Vec<_> = (1000..1008).map(|s| distances(s).1).collect();
+        for metric in 0..2 {
+            let mean = |which: usize| strangers.iter().map(|d| d[metric][which]).sum::<f64>() / strangers.len() as f64;
+            println!("{} {}", mean(0), mean(1));
+            assert!(mean(1) < 0.8 * mean(0), "{strangers:?}");
+        }
+    }
+
+    #[test]
     fn one_cycle_each_says_nothing_of_their_spread() {
         let cycles: Vec<Cycle> = (1..=4).map(|s| synthetic::subject(Activity::Walking, s).cycle(1.2, 0)).collect();
         let model = Model::build(Activity::Walking, true, &cycles).unwrap();
-        assert_eq!(log_odds(&Population::new(&model, 3), &model, &model.vector_of(&cycles[0]), 1.2), None);
+        assert_eq!(recognise(&Population::new(&model, 3), &model, &model.vector_of(&cycles[0]), 1.2), None);
     }
 }

@@ -17,6 +17,7 @@ pub mod validate;
 pub use curves::Population;
 pub use distance::Metric;
 pub use extrapolate::{Extrapolation, StyleError, extrapolate};
+pub use identity::Recognised;
 pub use nearest::Nearest;
 pub use transfer::transfer;
 
@@ -56,6 +57,15 @@ pub struct Neighbour {
     pub log_odds: Option<f64>,
 }
 
+/// The weights that recordings of a person in the database's manner are expected to have, see [`identity`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Expected {
+    pub weights: Vec<f64>,
+    /// Rows.
+    pub covariance: Vec<Vec<f64>>,
+}
+
 /// One person's style as observed once.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -72,6 +82,10 @@ pub struct Style {
     pub covariance: Option<Vec<Vec<f64>>>,
     /// Observed cycle frequency over the model's law at this parameter.
     pub cadence_factor: f64,
+    /// Of a tracked motion. `weights` describe the motion, with all that the tracked skeleton and the recorded ones do not
+    /// share; these are the person's among the recorded, and what the neighbours' distances are measured from.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expected: Option<Expected>,
     /// Database subjects that move at this parameter, nearest first.
     pub neighbours: Vec<Neighbour>,
     /// Body size where the observation gave one.
@@ -150,16 +164,36 @@ impl Style {
 
     /// With the odds that this is one of the database's subjects, by all that is known of the motion.
     pub fn identified(mut self, model: &Model) -> Style {
+        let found = self.recognise(model, &Population::new(model, self.weights.len()));
+        self.neighbours = with_odds(self.neighbours, found.as_ref());
+        self
+    }
+
+    /// A tracked motion's style: with the odds, the expected weights, and distances from these.
+    pub fn expecting(mut self, model: &Model) -> Style {
+        let population = Population::new(model, self.weights.len());
+        if let Some(found) = self.recognise(model, &population) {
+            self.neighbours = with_odds(population.neighbours(model, &found.weights, self.parameter), Some(&found));
+            let covariance = found.covariance.row_iter().map(|row| row.iter().copied().collect()).collect();
+            self.expected = Some(Expected { weights: found.weights.as_slice().to_vec(), covariance });
+        }
+        self
+    }
+
+    fn recognise(&self, model: &Model, population: &Population) -> Option<Recognised> {
         let mut vector = model.vector(&self.weights);
         if let Some(detail) = &self.detail {
             vector += &detail.vector;
         }
-        let population = Population::new(model, self.weights.len());
-        for (subject, odds) in identity::log_odds(&population, model, &vector, self.parameter).into_iter().flatten() {
-            let neighbour = self.neighbours.iter_mut().find(|n| n.subject == subject);
-            neighbour.into_iter().for_each(|n| n.log_odds = Some(odds));
+        identity::recognise(population, model, &vector, self.parameter)
+    }
+
+    /// Where the person is among the database's subjects, with the covariance of that.
+    pub fn place(&self) -> (&[f64], Option<&Vec<Vec<f64>>>) {
+        match &self.expected {
+            Some(expected) => (&expected.weights, Some(&expected.covariance)),
+            None => (&self.weights, self.covariance.as_ref()),
         }
-        self
     }
 
     /// The subject that explains the motion best, with its log odds against a stranger.
@@ -216,6 +250,7 @@ impl Style {
             weights: weights.iter().copied().collect(),
             covariance: None,
             cadence_factor: frequency_hz / model.cadence().frequency_hz(parameter, hip_height_m),
+            expected: None,
             neighbours,
             shape: None,
             departure: None,
@@ -239,6 +274,14 @@ impl Style {
         let style = Style::of_weights(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
         Some(Style { detail: first.detail, also, ..style }.identified(model))
     }
+}
+
+fn with_odds(mut neighbours: Vec<Neighbour>, found: Option<&Recognised>) -> Vec<Neighbour> {
+    for (subject, odds) in found.iter().flat_map(|f| &f.odds) {
+        let neighbour = neighbours.iter_mut().find(|n| n.subject == *subject);
+        neighbour.into_iter().for_each(|n| n.log_odds = Some(*odds));
+    }
+    neighbours
 }
 
 #[cfg(test)]

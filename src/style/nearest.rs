@@ -19,7 +19,8 @@ pub struct Nearest {
 impl Nearest {
     /// Of the subjects who move at the parameter of `style`; `None` where the database holds nobody.
     pub fn new(model: &Model, style: &Style) -> Option<Nearest> {
-        let weights = DVector::from_column_slice(&style.weights[..style.weights.len().min(model.basis.ncols())]);
+        let (weights, _) = style.place();
+        let weights = DVector::from_column_slice(&weights[..weights.len().min(model.basis.ncols())]);
         let found = Population::new(model, weights.len()).neighbours(model, &weights, style.parameter);
         let first = found.first()?;
         let population = Population::new(model, model.basis.ncols());

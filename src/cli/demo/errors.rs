@@ -37,7 +37,7 @@ pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, own: &Style, g
     let mut rows = cloud_rows(truth, tracked)?;
     rows.extend(joint_rows(truth, model, tracked));
     rows.extend(motion_rows(truth, tracked));
-    rows.extend(weight_rows(truth, model, tracked));
+    rows.extend(weight_rows(truth, model, own));
     rows.extend(speed_rows(truth, model, own, generated)?);
     Ok(rows)
 }
@@ -114,9 +114,9 @@ fn height_m(shape: &Shape) -> f64 {
 }
 
 /// Distances of equation (6) of the style paper.
-fn weight_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row> {
+fn weight_rows(truth: &Truth, model: &NamedModel, style: &Style) -> Vec<Row> {
     let model = &model.model;
-    let found = DVector::from_column_slice(&tracked.fit.state.weights);
+    let found = DVector::from_column_slice(style.place().0);
     let population = Population::new(model, found.len());
     let weights = |cycle: &Cycle| own_weights(model, cycle).rows(0, population.components()).into_owned();
     let distance = |a: &DVector<f64>, b: &DVector<f64>| Metric::Paper.distance(&population.eigenvalues, a, b);
