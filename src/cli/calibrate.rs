@@ -148,15 +148,17 @@ fn look(board: &Board, target: &Target, camera: &CameraViews, index: usize, ever
 /// The size that the board seems to have, where that is not the one given.
 fn other_size(board: &Board, pictures: &[GrayImage]) -> Result<Option<String>> {
     let Board::Chessboard { columns, rows, square_m } = *board else { return Ok(None) };
-    let steps = [[0, 0], [0, 1], [1, 0], [1, 2], [2, 1], [2, 2], [1, 1]];
-    for [x, y] in steps.into_iter().filter(|step| *step != [1, 1]) {
-        let Ok(other) = Board::chessboard(columns + x - 1, rows + y - 1, square_m) else { continue };
-        let target = other.target()?;
-        for picture in pictures {
-            if other.find(picture, &target)?.is_some() {
-                let (c, r) = (columns + x - 1, rows + y - 1);
-                return Ok(Some(format!("they show {c}x{r} inner corners, so give --board {c}x{r}")));
-            }
+    let size = |[x, y]: [usize; 2]| [columns + x - 1, rows + y - 1];
+    let sizes = [[0, 0], [0, 1], [1, 0], [1, 2], [2, 1], [2, 2]].map(size);
+    // A picture that shows another board takes OpenCV seconds, so that sizes are looked for at once, and in all before the next picture.
+    for picture in pictures {
+        let shown = |[c, r]: &[usize; 2]| {
+            let other = Board::chessboard(*c, *r, square_m).ok()?;
+            let found = other.target().and_then(|target| other.find(picture, &target));
+            found.map(|corners| corners.map(|_| [*c, *r])).transpose()
+        };
+        if let Some([c, r]) = sizes.par_iter().find_map_first(shown).transpose()? {
+            return Ok(Some(format!("they show {c}x{r} inner corners, so give --board {c}x{r}")));
         }
     }
     Ok(None)
