@@ -5,12 +5,13 @@ use std::io::{BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Quaternion, UnitQuaternion};
-use npyz::npz::NpzWriter;
-use npyz::{NpyFile, WriterBuilder};
+use npyz::npz::file_name_from_array_name;
+use npyz::{AutoSerialize, NpyFile, WriteOptions, WriterBuilder};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use zip::ZipArchive;
 use zip::result::ZipError;
+use zip::write::FileOptions;
+use zip::{CompressionMethod, DateTime, ZipArchive, ZipWriter};
 
 use super::write_atomic;
 use crate::body::{BALL_JOINTS, Joint};
@@ -112,21 +113,21 @@ pub fn hash(header: &impl Serialize, arrays: &[Array]) -> String {
 
 /// Stored without compression and without times, so that the same content gives the same bytes.
 pub fn archive(header: &impl Serialize, arrays: Vec<Array>) -> std::io::Result<Vec<u8>> {
-    let options = || {
-        zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored).last_modified_time(zip::DateTime::default())
-    };
-    let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     let json = serde_json::to_vec_pretty(header)?;
-    let mut writer = npz.array::<u8>("header", options())?.default_dtype().shape(&[json.len() as u64]).begin_nd()?;
-    writer.extend(json)?;
-    writer.finish()?;
+    put(&mut zip, "header", &[json.len() as u64], json)?;
     for array in arrays {
-        let mut writer = npz.array::<f64>(array.name, options())?.default_dtype().shape(&array.shape).begin_nd()?;
-        writer.extend(array.values)?;
-        writer.finish()?;
+        put(&mut zip, array.name, &array.shape, array.values)?;
     }
-    let cursor = npz.zip_writer().finish().map_err(std::io::Error::other)?;
-    Ok(cursor.into_inner())
+    Ok(zip.finish().map_err(std::io::Error::other)?.into_inner())
+}
+
+fn put<T: AutoSerialize>(zip: &mut ZipWriter<Cursor<Vec<u8>>>, name: &str, shape: &[u64], values: Vec<T>) -> std::io::Result<()> {
+    let options = FileOptions::default().compression_method(CompressionMethod::Stored).last_modified_time(DateTime::default());
+    zip.start_file(file_name_from_array_name(name), options)?;
+    let mut writer = WriteOptions::new().default_dtype().shape(shape).writer(zip).begin_nd()?;
+    writer.extend(values)?;
+    writer.finish()
 }
 
 pub struct Reader<R: Read + Seek> {

@@ -58,6 +58,7 @@ pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
     }
     let (person, covariance) = style.place();
     let person = place(person);
+    let meant = if style.expected.is_some() { " This person's are those that recordings would have." } else { "" };
     dots.push(Dots { label: "this person, 95 % ellipse".into(), points: vec![person], colour: INK, radius: 5.0, bars: Vec::new() });
     let ring = covariance.and_then(|c| {
         let entry = |i: usize, j: usize| Some(c.get(i)?.get(j)? / scales[i] / scales[j]);
@@ -72,7 +73,7 @@ pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
         dots,
         names,
         height: 300.0,
-        caption: "First two weights of every cycle of the database, named by subject.".into(),
+        caption: format!("First two weights of every cycle of the database, named by subject.{meant}"),
         ..Chart::default()
     }
     .figure()

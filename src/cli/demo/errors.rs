@@ -116,21 +116,19 @@ fn height_m(shape: &Shape) -> f64 {
 /// Distances of equation (6) of the style paper.
 fn weight_rows(truth: &Truth, model: &NamedModel, style: &Style) -> Vec<Row> {
     let model = &model.model;
-    let found = DVector::from_column_slice(style.place().0);
-    let population = Population::new(model, found.len());
+    let population = Population::new(model, style.weights.len());
     let weights = |cycle: &Cycle| own_weights(model, cycle).rows(0, population.components()).into_owned();
     let distance = |a: &DVector<f64>, b: &DVector<f64>| Metric::Paper.distance(&population.eigenvalues, a, b);
     let own = weights(&truth.cycle);
+    let from = |found: &[f64]| distance(&DVector::from_column_slice(found), &own);
     let repeats: Vec<_> = (0..REPEATS).map(|r| weights(&truth.subject.cycle(SPEED_M_S, r))).collect();
     let pairs: Vec<f64> =
         (0..repeats.len()).flat_map(|i| (0..i).map(move |k| (i, k))).map(|(i, k)| distance(&repeats[i], &repeats[k])).collect();
     let people: Vec<f64> = population.distances(&own, SPEED_M_S, Metric::Paper);
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
-    vec![
-        Row::new("weights, equation (6)", distance(&found, &own), "")
-            .beside("between own cycles", mean(&pairs))
-            .beside("to other people", mean(&people)),
-    ]
+    let found = Row::new("weights, equation (6)", from(&style.weights), "");
+    let expected = style.expected.iter().map(|expected| Row::new("the same, expected of recordings", from(&expected.weights), ""));
+    [found.beside("between own cycles", mean(&pairs)).beside("to other people", mean(&people))].into_iter().chain(expected).collect()
 }
 
 /// The generated cycles against the subject's own true motion at those speeds, on the true body.

@@ -168,7 +168,7 @@ impl Style {
                 let curve: Vec<f64> = (0..SAMPLES).map(|i| population(channel, phase(i) + delay + shift, at)).collect();
                 let mean = curve.iter().sum::<f64>() / SAMPLES as f64;
                 for (i, y) in curve.iter().enumerate() {
-                    let detail = harmonic_sum(&own.harmonics, phase(i) + delay);
+                    let detail = turned_sum(&own.harmonics, &turns(own.harmonics.len(), phase(i) + delay));
                     tracks[i][track(channel, side)] = mean + own.gain * (y - mean) + own.offset_deg + detail;
                 }
             }
@@ -213,10 +213,6 @@ pub(super) fn phase(sample: usize) -> f64 {
 fn harmonics(count: usize, spread: f64, rng: &mut ChaCha12Rng) -> Vec<[f64; 2]> {
     let each = spread / (count as f64).sqrt();
     (0..count).map(|_| [each * normal(rng), each * normal(rng)]).collect()
-}
-
-fn harmonic_sum(harmonics: &[[f64; 2]], phase: f64) -> f64 {
-    turned_sum(harmonics, &turns(harmonics.len(), phase))
 }
 
 /// Sine and cosine of the first harmonics' angles.
