@@ -13,7 +13,8 @@
 //! Departure: equation (6) of the style paper weighs a weight by its λ². The first weights of marker sets hold how wrists
 //! and heads were marked, so between the weights of a tracked motion and recordings it compares what two skeletons do not share;
 //! between (3) and recordings it does not.
-//! Fails when nobody of the database has two cycles: then W is not known.
+//! Fails when nobody of the database has two cycles: then W is not known. Of a body that is the database's own, as a phantom's, (3)
+//! gives away what the constants tell, and the plain weights are nearer.
 //! Checked against the densities written out and quadrature, and on people with cycles in the database and without.
 
 use nalgebra::{DMatrix, DVector};
