@@ -1,11 +1,9 @@
 //! The animal pipeline as a zoologist runs it, on a rendered horse: masks, verdict, keys, poses, animation; wrong input.
 
-mod common;
-
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use common::run;
+use crate::common::run;
 use image::{GrayImage, Rgb, RgbImage};
 use muybridge::animal::creature::{Creature, Local, Motion, Posture};
 use muybridge::animal::horse::{Gait, horse};

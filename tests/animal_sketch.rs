@@ -1,12 +1,10 @@
 //! The sketch page in a headless Chromium, driven through WebDriver: strokes, onion skin, copy, undo, boxes, saving; and who
 //! is not answered. `.ci/install` installs Chromium and its driver.
 
-mod browser;
-
 use std::path::Path;
 use std::process::Command;
 
-use browser::{Browser, http, started};
+use crate::browser::{Browser, http, started};
 use image::{Rgb, RgbImage};
 use serde_json::{Value, json};
 

@@ -1,14 +1,12 @@
 //! A study of short sessions, some of them broken, through `muybridge batch`: everything else is done, a second run does
 //! nothing, an edit redoes one session, and kills at any moment change no byte.
 
-mod study;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use study::*;
+use crate::study::*;
 
 /// Ends a process as the system does when memory is short.
 fn kill(process: u32) {

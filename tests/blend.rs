@@ -1,11 +1,9 @@
 //! The vector space of motions on recorded walks, and the command `blend` as a user runs it. Recordings lie beside the project;
 //! without them their tests say so and pass.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::{mocap, run};
+use crate::common::{mocap, run};
 use muybridge::body::{Joint, Pose, Shape, place};
 use muybridge::io::read_clip;
 use muybridge::math::rotation::exp;

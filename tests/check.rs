@@ -1,9 +1,7 @@
 //! `muybridge check` on footage of the phantom with one thing wrong at a time: it names the thing and the remedy.
 
-mod common;
-
+use crate::common::{half_lab, walk_across};
 use assert_cmd::Command;
-use common::{half_lab, walk_across};
 use image::{GrayImage, Luma, imageops};
 use muybridge::footage::check::masks;
 use muybridge::footage::epipolar::pair_matches;

@@ -3,8 +3,6 @@
 //!
 //! Disks are tmpfs in a mount namespace of their own, which goes with the last process in it; only root may mount them.
 
-mod study;
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{Read, Write};
@@ -12,11 +10,11 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, SystemTime};
 
+use crate::study::*;
 use muybridge::body::Shape;
 use muybridge::io::bvh;
 use muybridge::motion::{Length, play_cycle};
 use muybridge::motion_model::{Activity, synthetic};
-use study::*;
 
 /// Whether this user may mount.
 fn can_mount() -> bool {

@@ -1,10 +1,8 @@
 //! The fit on measurements made without pictures, whose truth is a state of the model itself.
 
-mod common;
-
 use std::sync::Arc;
 
-use common::across;
+use crate::common::across;
 use muybridge::body::{Joint, NODES, Pose, PosedSurface, Shape, Surface, place};
 use muybridge::clouds::{Cloud, CloudPoint};
 use muybridge::fit::curve::Curve;

@@ -1,10 +1,8 @@
 //! `generate` along profiles and bends, with planted feet, and recorded jumps at other lengths, as a user runs it.
 
-mod common;
-
 use std::path::{Path, PathBuf};
 
-use common::{cycles, mocap, path, run};
+use crate::common::{cycles, mocap, path, run};
 use muybridge::body::{Joint, Pose};
 use muybridge::io::model_npz::{model_hash, read_model};
 use muybridge::io::{bvh, read_clip, style_json};

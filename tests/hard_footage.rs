@@ -1,14 +1,12 @@
 //! Footage with something wrong in it, through the program: what can be tracked is, with the frames named that were left to their
 //! neighbours; the rest is one sentence.
 
-mod common;
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::sync::OnceLock;
 
+use crate::common::{half_lab, walk_across};
 use assert_cmd::Command;
-use common::{half_lab, walk_across};
 use image::GrayImage;
 use muybridge::body::{Pose, Shape};
 use muybridge::io::calib_toml;

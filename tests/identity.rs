@@ -1,7 +1,5 @@
 //! Who a recorded walk belongs to: every CMU trial against a database that has the others, equation (6) beside the evidence.
 
-mod common;
-
 use muybridge::motion_model::{Activity, Cycle, Model, database};
 use muybridge::style::curves::mean_vector;
 use muybridge::style::{Population, Style, curves::knots, identity};
@@ -16,7 +14,7 @@ fn trial(cycle: &Cycle) -> &str {
 
 #[test]
 fn recorded_walkers_are_found_by_evidence() {
-    let Some(cycles) = common::cycles("cmu-asfamc", Activity::Walking) else { return };
+    let Some(cycles) = crate::common::cycles("cmu-asfamc", Activity::Walking) else { return };
     let cycles = database::thin(cycles).0;
     let mut trials: Vec<&str> = cycles.iter().map(trial).collect();
     trials.sort();

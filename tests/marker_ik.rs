@@ -1,10 +1,8 @@
 //! Inverse kinematics of markers against the data sets' own (OpenSim), and of a known clip through noise, gaps and exchanges.
 
-mod common;
-
 use std::path::Path;
 
-use common::mocap;
+use crate::common::mocap;
 use muybridge::body::{Clip, Joint, Pose};
 use muybridge::io::manifest::find_motions;
 use muybridge::io::markers::read;

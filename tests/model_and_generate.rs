@@ -1,10 +1,8 @@
 //! The commands `model` and `generate` as a user runs them, on the synthetic database.
 
-mod common;
-
 use std::path::Path;
 
-use common::{path, run};
+use crate::common::{path, run};
 
 /// Speed over the floor of a written BVH, from its root channels alone.
 fn root_speed_m_s(bvh: &Path) -> f64 {

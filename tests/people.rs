@@ -1,10 +1,8 @@
 //! Clouds of a person that the phantom renders: against the known surface, against OpenCV, and under bad light.
 
-mod common;
-
 use std::path::Path;
 
-use common::walk_across;
+use crate::common::walk_across;
 use image::GrayImage;
 use muybridge::body::{Placement, Pose, PosedSurface, place};
 use muybridge::clouds::{CloudError, CloudOptions, CloudRig, FrameCloud};

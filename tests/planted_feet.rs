@@ -1,9 +1,7 @@
 //! Planted feet of recorded people, whose toes move, followed by forward kinematics. Data lie beside the project; without them
 //! the test says so and passes.
 
-mod common;
-
-use common::cycles;
+use crate::common::cycles;
 use muybridge::body::{Clip, Joint, Shape};
 use muybridge::math::{order, rotation::log};
 use muybridge::motion::contact::FootTrack;

@@ -1,8 +1,6 @@
 //! Motion models from recorded walks and runs. Data lie beside the project; without them the tests say so and pass.
 
-mod common;
-
-use common::{cut, cycles, mocap};
+use crate::common::{cut, cycles, mocap};
 use muybridge::body::{Clip, Pose};
 use muybridge::io::manifest::find_motions;
 use muybridge::math::rotation::exp;

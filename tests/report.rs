@@ -1,12 +1,10 @@
 //! Every report page in a headless Chromium: pictures load, nothing is fetched, nothing overflows on a telephone, light and
 //! dark, names are shown and not run, the view turns. The numbers beside a page agree with the footage's truth.
 
-mod browser;
-
 use std::path::{Path, PathBuf};
 
+use crate::browser::Browser;
 use assert_cmd::Command;
-use browser::Browser;
 use muybridge::animal::horse::{Gait, horse, posture};
 use muybridge::animal::render::{View, silhouette};
 use muybridge::io::{bvh, model_npz};

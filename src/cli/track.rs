@@ -100,6 +100,7 @@ impl NamedModel {
 /// A fit with the session it belongs to.
 pub struct Tracked {
     pub fit: Fit,
+    pub style: Style,
     pub observations: Vec<Observation>,
     /// The pictures of all cameras for each frame of the strips: index of the frame, pictures.
     pub pictures: Vec<(usize, Vec<GrayImage>)>,
@@ -154,7 +155,7 @@ pub fn run(args: &TrackArgs) -> Result<()> {
         track_report::write(&args.output, &session, &models, &tracked)?;
     }
     if config.pictures == Some(true) {
-        draw(&args.output.join("pictures"), &session.rig, &models[tracked.fit.model], &tracked)?;
+        draw(&args.output.join("pictures"), &session.rig, &models[tracked.fit.model].model, &tracked)?;
     }
     #[cfg(feature = "rerun")]
     if let Some(path) = &args.rrd {
@@ -239,12 +240,13 @@ pub fn fit_to(session: &Session, seen: Seen, models: &[NamedModel], options: &Fi
     })
     .with_context(|| session.folder.display().to_string())?;
     bar.finish();
-    Ok(Tracked { fit, observations, pictures, depth })
+    let style = style(&fit, &models[fit.model]);
+    Ok(Tracked { fit, style, observations, pictures, depth })
 }
 
 /// Writes the files of a session that was tracked with the best of these models.
 pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<()> {
-    let Tracked { fit, observations, .. } = tracked;
+    let Tracked { fit, style, observations, .. } = tracked;
     let model = &models[fit.model];
     let placements = placements(fit);
     let frames: Vec<(usize, f64)> = observations.iter().map(|o| (o.number, o.time_s)).collect();
@@ -260,7 +262,7 @@ pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &
         joints_csv::write(&folder.join("joints.csv"), &frames, &positions)?;
         let sigmas: Vec<_> = fit.uncertainty.iter().flat_map(|u| &u.frames).map(|f| f.joints_m).collect();
         joints_csv::write_sigmas(&folder.join("uncertainty.csv"), &frames, &sigmas)?;
-        style_json::write_style(&folder.join("style.json"), &style(fit, model))?;
+        style_json::write_style(&folder.join("style.json"), style)?;
         let report = folder.join("fit.json");
         let names: Vec<ModelName> = models.iter().map(NamedModel::report_name).collect();
         fit_json::write(&report, fit, observations, &names).with_context(|| report.display().to_string())
@@ -281,9 +283,9 @@ pub fn style(fit: &Fit, model: &NamedModel) -> Style {
     let rows = 0..weights.len();
     let covariance =
         rows.clone().map(|i| rows.clone().map(|j| fit.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, j)])).collect()).collect();
-    let style = Style::of_weights(&model.model, &model.hash, &weights, fit.parameter(model.model.activity), hip_height, fit.cadence_hz);
-    let style = Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style };
-    style.departing(own_motion::departure(fit, &model.model)).expecting(&model.model)
+    let (parameter, departure) = (fit.parameter(model.model.activity), own_motion::departure(fit, &model.model));
+    let style = Style::of_tracked(&model.model, &model.hash, &weights, parameter, hip_height, fit.cadence_hz, departure);
+    Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }
 }
 
 /// The fitted poses in a y-up world, one per 1/fps second, dropped frames filled in; and the rotation into that world.
@@ -306,8 +308,8 @@ pub(super) fn clip(fit: &Fit, rig: &Rig, observations: &[Observation], fps: f64)
 
 /// Overlays for each camera, the cloud with the body of the middle frame, curves of phase and root, and the weights among
 /// the model's.
-pub fn draw(folder: &Path, rig: &Rig, model: &NamedModel, tracked: &Tracked) -> Result<()> {
-    let Tracked { fit, observations, pictures, .. } = tracked;
+pub fn draw(folder: &Path, rig: &Rig, model: &Model, tracked: &Tracked) -> Result<()> {
+    let Tracked { fit, style, observations, pictures, .. } = tracked;
     let placements = placements(fit);
     let (surface, offsets) = (muybridge::body::Surface::new(fit.shape()), fit.shape().offsets());
     for (k, camera) in rig.cameras.iter().enumerate() {
@@ -328,9 +330,8 @@ pub fn draw(folder: &Path, rig: &Rig, model: &NamedModel, tracked: &Tracked) -> 
     let title = format!("Cloud and body, frame {}", observations[middle].number);
     report::save(&folder.join("cloud.png"), &report::cloud_and_body(&dots, &placements[middle].positions, rig.up, &title)?)?;
     draw_curves(folder, tracked)?;
-    let style = style(fit, model);
     let (weights, covariance) = style.place();
-    let picture = report::clusters(&model.model, weights, covariance, "This person among the model's subjects")?;
+    let picture = report::clusters(model, weights, covariance, "This person among the model's subjects")?;
     Ok(report::save(&folder.join("weights.png"), &picture)?)
 }
 

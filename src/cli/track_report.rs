@@ -10,12 +10,12 @@ use muybridge::report::track::{TrackReport, thumbnail};
 use muybridge::report::walk::Walk;
 
 use super::motions::file_name;
-use super::track::{NamedModel, Tracked, clip, style};
+use super::track::{NamedModel, Tracked, clip};
 
 /// Writes report.html, thumbnail.jpg and, for gaits, gait.csv and angles_cycle.csv. The page names
 /// the session by its folder alone, so that it is the same wherever the study stands.
 pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<()> {
-    let Tracked { fit, observations, pictures, depth } = tracked;
+    let Tracked { fit, style, observations, pictures, depth } = tracked;
     let model = &models[fit.model];
     let whole = session.folder.canonicalize().unwrap_or_else(|_| session.folder.clone());
     let name = file_name(&whole);
@@ -39,7 +39,7 @@ pub fn write(folder: &Path, session: &Session, models: &[NamedModel], tracked: &
         observations,
         pictures,
         depth: depth.as_ref().map(|(number, map)| (*number, map)),
-        style: &style(fit, model),
+        style,
         walk: walk.as_ref(),
         options: &[("components in the last stage", fit.state.weights.len().to_string())],
     };

@@ -14,12 +14,7 @@ const ELLIPSE: f64 = 2.448;
 /// The first two weights of every cycle, a colour and a name per subject, and `weights` with its 95 % ellipse where
 /// `covariance` (rows) is known; in units of the population's standard deviation.
 pub fn clusters(model: &Model, weights: &[f64], covariance: Option<&Vec<Vec<f64>>>, title: &str) -> Result<RgbImage, ReportError> {
-    let series = series(model);
-    let scale = |i: usize| model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12));
-    let person = units(model, weights);
-    let entry = |i: usize, j: usize| Some(covariance?.get(i)?.get(j)? / scale(i) / scale(j)).filter(|v| v.is_finite());
-    let entries = entry(0, 0).zip(entry(0, 1)).zip(entry(1, 1));
-    let ring = entries.map(|((xx, xy), yy)| ellipse(person, [xx, xy, yy]));
+    let (series, person, ring) = (series(model), units(model, weights), ring(model, weights, covariance));
     let found =
         Curve { label: String::new(), points: ring.clone().unwrap_or_else(|| vec![person]), dashed: false, colour: 0, band: Vec::new() };
     let all: Vec<Curve> = series.iter().cloned().chain([found]).collect();
@@ -43,9 +38,20 @@ pub fn database_clusters(model: &Model, title: &str) -> Result<RgbImage, ReportE
     Ok(subjects(&Frame::around(&series, 1000.0, 720.0), &series, title)?.picture)
 }
 
+/// Standard deviation of a weight over the database.
+pub(super) fn scale(model: &Model, i: usize) -> f64 {
+    model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12))
+}
+
 /// First two weights over their standard deviations.
-fn units(model: &Model, weights: &[f64]) -> [f64; 2] {
-    [0, 1].map(|i| weights.get(i).copied().unwrap_or(0.0) / model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12)))
+pub(super) fn units(model: &Model, weights: &[f64]) -> [f64; 2] {
+    [0, 1].map(|i| weights.get(i).copied().unwrap_or(0.0) / scale(model, i))
+}
+
+/// The 95 % ellipse about [`units`]; `None` where the covariance (rows) of the weights is not known.
+pub(super) fn ring(model: &Model, weights: &[f64], covariance: Option<&Vec<Vec<f64>>>) -> Option<Vec<[f64; 2]>> {
+    let entry = |i: usize, j: usize| Some(covariance?.get(i)?.get(j)? / scale(model, i) / scale(model, j)).filter(|v| v.is_finite());
+    Some(ellipse(units(model, weights), [entry(0, 0)?, entry(0, 1)?, entry(1, 1)?]))
 }
 
 fn series(model: &Model) -> Vec<Curve> {
@@ -79,7 +85,7 @@ fn subjects(frame: &Frame, series: &[Curve], title: &str) -> Result<Canvas, Repo
 }
 
 /// The 95 % ellipse of covariance [xx, xy, yy] about a point.
-pub(super) fn ellipse(centre: [f64; 2], [xx, xy, yy]: [f64; 3]) -> Vec<[f64; 2]> {
+fn ellipse(centre: [f64; 2], [xx, xy, yy]: [f64; 3]) -> Vec<[f64; 2]> {
     let axes = SymmetricEigen::new(nalgebra::Matrix2::new(xx, xy, xy, yy));
     let half = axes.eigenvalues.map(|v| ELLIPSE * v.max(0.0).sqrt());
     let at = |k: i32| {

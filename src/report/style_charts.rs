@@ -4,7 +4,7 @@ use maud::{Markup, html};
 use nalgebra::DVector;
 
 use super::chart::{Chart, Dots, INK};
-use super::clusters::ellipse;
+use super::clusters::{ring, scale, units};
 use super::curves::Curve;
 use super::page::{gallery, table};
 use super::track::KNOWN;
@@ -17,10 +17,6 @@ use crate::style::{Population, Style};
 const DRAWN: usize = 4;
 /// Nearest subjects that are listed.
 const LISTED: usize = 6;
-
-fn scale(model: &Model, i: usize) -> f64 {
-    model.eigenvalues.get(i).map_or(1.0, |l| l.sqrt().max(1e-12))
-}
 
 /// Standard deviation of a weight, in its own units.
 fn sigma(style: &Style, i: usize) -> f64 {
@@ -41,30 +37,29 @@ pub(super) fn section(model: &Model, style: &Style, uncertainty: &[f64]) -> Mark
 
 /// Figure 2: the first two weights of every cycle, with the person's and its 95 % ellipse; a tracked person's are the expected ones.
 pub(super) fn clusters(model: &Model, style: &Style) -> Markup {
-    let scales = [scale(model, 0), scale(model, 1)];
-    let place = |w: &[f64]| [0, 1].map(|i| w.get(i).copied().unwrap_or(0.0) / scales[i]);
     let (mut dots, mut names) = (Vec::new(), Vec::new());
     let weights = model.leading_weights(2);
     for (k, subject) in model.subjects().into_iter().enumerate() {
         let own = model.members.iter().zip(weights.column_iter()).filter(|(m, _)| m.subject == subject);
-        let points: Vec<[f64; 2]> = own.map(|(_, weights)| place(weights.as_slice())).collect();
+        let points: Vec<[f64; 2]> = own.map(|(_, weights)| units(model, weights.as_slice())).collect();
         let n = points.len() as f64;
         names.push(([0, 1].map(|a| points.iter().map(|p| p[a]).sum::<f64>() / n), subject.to_string()));
         dots.push(Dots { points, colour: k % INK, radius: 2.4, ..Dots::default() });
     }
     if style.expected.is_some() {
-        let tracked = vec![place(&style.weights)];
+        let tracked = vec![units(model, &style.weights)];
         dots.push(Dots { label: "the tracked motion".into(), points: tracked, colour: 6, radius: 4.0, ..Dots::default() });
     }
     let (person, covariance) = style.place();
-    let person = place(person);
     let meant = if style.expected.is_some() { " This person's are those that recordings would have." } else { "" };
-    dots.push(Dots { label: "this person, 95 % ellipse".into(), points: vec![person], colour: INK, radius: 5.0, bars: Vec::new() });
-    let ring = covariance.and_then(|c| {
-        let entry = |i: usize, j: usize| Some(c.get(i)?.get(j)? / scales[i] / scales[j]);
-        Some(ellipse(person, [entry(0, 0)?, entry(0, 1)?, entry(1, 1)?]))
+    dots.push(Dots {
+        label: "this person, 95 % ellipse".into(),
+        points: vec![units(model, person)],
+        colour: INK,
+        radius: 5.0,
+        bars: Vec::new(),
     });
-    let points = ring.filter(|r| r.iter().flatten().all(|v| v.is_finite())).unwrap_or_default();
+    let points = ring(model, person, covariance).unwrap_or_default();
     Chart {
         title: "Among the model's subjects".into(),
         x_label: "first weight".into(),

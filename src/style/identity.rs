@@ -241,14 +241,20 @@ mod tests {
         assert!((&covariance - &second).amax() < 1e-6, "{covariance} {second}");
     }
 
-    #[test]
-    fn known_people_are_found_and_strangers_are_less_like_anybody() {
-        let known = |s: u64| {
+    /// Subjects 1 to 9 at three speeds, three cycles each, with their names.
+    fn nine_walkers() -> (Model, Population, Vec<String>) {
+        let own = |s: u64| {
             [0.9, 1.2, 1.5].into_iter().flat_map(move |v| (0..3).map(move |k| synthetic::subject(Activity::Walking, s).cycle(v, k)))
         };
-        let cycles: Vec<Cycle> = (1..=9).flat_map(known).collect();
+        let cycles: Vec<Cycle> = (1..=9).flat_map(own).collect();
         let model = Model::build(Activity::Walking, true, &cycles).unwrap();
         let population = Population::new(&model, 12);
+        (model, population, cycles.chunks(9).map(|own| own[0].subject.clone()).collect())
+    }
+
+    #[test]
+    fn known_people_are_found_and_strangers_are_less_like_anybody() {
+        let (model, population, names) = nine_walkers();
         let odds = |s: u64| {
             let vector = model.vector_of(&synthetic::subject(Activity::Walking, s).cycle(1.35, 7));
             let mut found = recognise(&population, &model, &vector, 1.35).unwrap().odds;
@@ -258,8 +264,8 @@ mod tests {
         let mut own = Vec::new();
         for subject in 1..=9 {
             let found = odds(subject);
-            let name = cycles[9 * (subject as usize - 1)].subject.clone();
-            assert!(found.len() == 9 && found[0].0 == name && found[0].1 > 3.0 && found[0].1 > found[1].1 + 3.0, "{name}: {found:?}");
+            let name = &names[subject as usize - 1];
+            assert!(found.len() == 9 && found[0].0 == *name && found[0].1 > 3.0 && found[0].1 > found[1].1 + 3.0, "{name}: {found:?}");
             own.push(found[0].1);
         }
         // Nine people leave room for somebody who moves much like one of them, but not for many.
@@ -270,12 +276,7 @@ mod tests {
 
     #[test]
     fn another_skeleton_does_not_move_a_person_away_from_the_own_recordings() {
-        let known = |s: u64| {
-            [0.9, 1.2, 1.5].into_iter().flat_map(move |v| (0..3).map(move |k| synthetic::subject(Activity::Walking, s).cycle(v, k)))
-        };
-        let cycles: Vec<Cycle> = (1..=9).flat_map(known).collect();
-        let model = Model::build(Activity::Walking, true, &cycles).unwrap();
-        let population = Population::new(&model, 12);
+        let (model, population, names) = nine_walkers();
         // Distances of the plain projection and of the expected weights from the person's own, by (6) and by Mahalanobis.
         let distances = |s: u64| {
             let vector = model.vector_of(&synthetic::subject(Activity::Walking, s).cycle(1.2, 7));
@@ -290,7 +291,7 @@ mod tests {
         };
         for s in 1..=9 {
             let (nearest, [paper, mahalanobis]) = distances(s);
-            assert!(nearest == cycles[9 * (s as usize - 1)].subject, "{s}: {nearest}");
+            assert!(nearest == names[s as usize - 1], "{s}: {nearest}");
             assert!(paper[1] < 0.5 * paper[0] && mahalanobis[1] < 0.5 * mahalanobis[0], "{s}: {paper:?} {mahalanobis:?}");
         }
         // Somebody who is taken for another gains least by (6), which looks at the first weights only.

@@ -66,6 +66,13 @@ pub struct Expected {
     pub covariance: Vec<Vec<f64>>,
 }
 
+impl From<Recognised> for Expected {
+    fn from(found: Recognised) -> Expected {
+        let covariance = found.covariance.row_iter().map(|row| row.iter().copied().collect()).collect();
+        Expected { weights: found.weights.as_slice().to_vec(), covariance }
+    }
+}
+
 /// One person's style as observed once.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -162,24 +169,6 @@ impl Style {
         Style { detail: departure.as_ref().map(Departure::detail), departure, ..self }
     }
 
-    /// With the odds that this is one of the database's subjects, by all that is known of the motion.
-    pub fn identified(mut self, model: &Model) -> Style {
-        let found = self.recognise(model, &Population::new(model, self.weights.len()));
-        self.neighbours = with_odds(self.neighbours, found.as_ref());
-        self
-    }
-
-    /// A tracked motion's style: with the odds, the expected weights, and distances from these.
-    pub fn expecting(mut self, model: &Model) -> Style {
-        let population = Population::new(model, self.weights.len());
-        if let Some(found) = self.recognise(model, &population) {
-            self.neighbours = with_odds(population.neighbours(model, &found.weights, self.parameter), Some(&found));
-            let covariance = found.covariance.row_iter().map(|row| row.iter().copied().collect()).collect();
-            self.expected = Some(Expected { weights: found.weights.as_slice().to_vec(), covariance });
-        }
-        self
-    }
-
     fn recognise(&self, model: &Model, population: &Population) -> Option<Recognised> {
         let mut vector = model.vector(&self.weights);
         if let Some(detail) = &self.detail {
@@ -240,8 +229,31 @@ impl Style {
         hip_height_m: f64,
         frequency_hz: f64,
     ) -> Style {
+        let neighbours = Population::new(model, weights.len()).neighbours(model, weights, parameter);
+        Style { neighbours, ..Style::alone(model, model_hash, weights, parameter, hip_height_m, frequency_hz) }
+    }
+
+    /// The same of a tracked motion, with what of it the weights do not hold: with the odds that this is one of the database's
+    /// subjects, the expected weights, and distances from these.
+    pub fn of_tracked(
+        model: &Model,
+        model_hash: &str,
+        weights: &DVector<f64>,
+        parameter: f64,
+        hip_height_m: f64,
+        frequency_hz: f64,
+        departure: Option<Departure>,
+    ) -> Style {
+        let style = Style::alone(model, model_hash, weights, parameter, hip_height_m, frequency_hz).departing(departure);
         let population = Population::new(model, weights.len());
-        let neighbours = population.neighbours(model, weights, parameter);
+        let found = style.recognise(model, &population);
+        let place = found.as_ref().map_or(weights, |f| &f.weights);
+        let neighbours = with_odds(population.neighbours(model, place, parameter), found.as_ref());
+        Style { neighbours, expected: found.map(Expected::from), ..style }
+    }
+
+    /// Without anybody beside it.
+    fn alone(model: &Model, model_hash: &str, weights: &DVector<f64>, parameter: f64, hip_height_m: f64, frequency_hz: f64) -> Style {
         Style {
             activity: model.activity,
             model_hash: model_hash.to_string(),
@@ -251,7 +263,7 @@ impl Style {
             covariance: None,
             cadence_factor: frequency_hz / model.cadence().frequency_hz(parameter, hip_height_m),
             expected: None,
-            neighbours,
+            neighbours: Vec::new(),
             shape: None,
             departure: None,
             detail: None,
@@ -271,8 +283,12 @@ impl Style {
         let n = cycles.len() as f64;
         let hip_height_m = cycles.iter().map(|c| c.hip_height_m).sum::<f64>() / n;
         let frequency_hz = first.cadence_factor * model.cadence().frequency_hz(first.parameter, hip_height_m);
-        let style = Style::of_weights(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
-        Some(Style { detail: first.detail, also, ..style }.identified(model))
+        let style = Style::alone(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
+        let style = Style { detail: first.detail, also, ..style };
+        let population = Population::new(model, weights.len());
+        let found = style.recognise(model, &population);
+        let neighbours = with_odds(population.neighbours(model, &weights, style.parameter), found.as_ref());
+        Some(Style { neighbours, ..style })
     }
 }
 

@@ -1,8 +1,5 @@
 //! What several test files have in common.
 
-// Not every one of them needs all.
-#![allow(dead_code)]
-
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;

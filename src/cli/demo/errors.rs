@@ -33,12 +33,12 @@ model alone: the true cycle as the model's components show it; true style: gener
 unchanged: the recovered motion replayed as filmed; average person: mean of the database's people at that speed.
 ";
 
-pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, own: &Style, generated: &[Generated]) -> Result<Vec<Row>> {
+pub fn rows(truth: &Truth, model: &NamedModel, tracked: &Tracked, generated: &[Generated]) -> Result<Vec<Row>> {
     let mut rows = cloud_rows(truth, tracked)?;
-    rows.extend(joint_rows(truth, model, tracked));
+    rows.extend(joint_rows(truth, &model.model, tracked));
     rows.extend(motion_rows(truth, tracked));
-    rows.extend(weight_rows(truth, model, own));
-    rows.extend(speed_rows(truth, model, own, generated)?);
+    rows.extend(weight_rows(truth, &model.model, &tracked.style));
+    rows.extend(speed_rows(truth, model, &tracked.style, generated)?);
     Ok(rows)
 }
 
@@ -65,11 +65,11 @@ fn cloud_rows(truth: &Truth, tracked: &Tracked) -> Result<Vec<Row>> {
     ])
 }
 
-fn joint_rows(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Vec<Row> {
+fn joint_rows(truth: &Truth, model: &Model, tracked: &Tracked) -> Vec<Row> {
     let positions = |poses: &[Pose], offsets: &Positions| -> Vec<Positions> { poses.iter().map(|p| place(offsets, p).positions).collect() };
     let found = positions(&tracked.fit.poses, &tracked.fit.shape().offsets());
     let errors = joint_errors(&found, &positions(&truth.poses, &truth.subject.shape().offsets()));
-    let shown = model.model.cycle(own_weights(&model.model, &truth.cycle).as_slice(), "", SPEED_M_S, 1.0, 1.0);
+    let shown = model.cycle(own_weights(model, &truth.cycle).as_slice(), "", SPEED_M_S, 1.0, 1.0);
     let least = against(truth, &shown, &truth.cycle);
     let mut rows = vec![
         Row::new("joints, absolute", 1e3 * errors.absolute_m, "mm"),
@@ -114,8 +114,7 @@ fn height_m(shape: &Shape) -> f64 {
 }
 
 /// Distances of equation (6) of the style paper.
-fn weight_rows(truth: &Truth, model: &NamedModel, style: &Style) -> Vec<Row> {
-    let model = &model.model;
+fn weight_rows(truth: &Truth, model: &Model, style: &Style) -> Vec<Row> {
     let population = Population::new(model, style.weights.len());
     let weights = |cycle: &Cycle| own_weights(model, cycle).rows(0, population.components()).into_owned();
     let distance = |a: &DVector<f64>, b: &DVector<f64>| Metric::Paper.distance(&population.eigenvalues, a, b);

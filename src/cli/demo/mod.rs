@@ -113,11 +113,11 @@ fn demonstrate(folder: &Path, frames: usize) -> Result<String> {
     })?;
     let tracked = clock.time("fit", || track::fit_to(&session, seen, &models, &FitOptions::default(), None))?;
     let model = &models[tracked.fit.model];
-    let (style, generated) = clock.time("style and new speeds", || generate(folder, &session, &models, &tracked))?;
+    let generated = clock.time("style and new speeds", || generate(folder, &session, &models, &tracked))?;
     let rows = clock.time("errors and pictures", || {
-        let rows = errors::rows(&truth, model, &tracked, &style, &generated)?;
-        track::draw(&folder.join("pictures"), &session.rig, model, &tracked)?;
-        pictures::draw(&folder.join("pictures"), &truth, model, &tracked, &generated, tracked.depth.as_ref().map(|d| &d.1))?;
+        let rows = errors::rows(&truth, model, &tracked, &generated)?;
+        track::draw(&folder.join("pictures"), &session.rig, &model.model, &tracked)?;
+        pictures::draw(&folder.join("pictures"), &truth, &model.model, &tracked, &generated)?;
         Ok(rows)
     })?;
     let text = table::text(&rows, errors::NOTES, &clock.0);
@@ -154,21 +154,19 @@ fn announce(session: &Session) -> Result<()> {
     Ok(())
 }
 
-/// Writes what `track` and `generate` write; returns the tracked person's style and the motions made of it.
-fn generate(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<(Style, Vec<Generated>)> {
+/// Writes what `track` and `generate` write; returns the motions made.
+fn generate(folder: &Path, session: &Session, models: &[NamedModel], tracked: &Tracked) -> Result<Vec<Generated>> {
     track::write(&folder.join("track"), session, models, tracked)?;
     track_report::write(&folder.join("track"), session, models, tracked)?;
     let model = &models[tracked.fit.model];
-    let style = track::style(&tracked.fit, model);
     let offsets = tracked.fit.shape().offsets();
     let one = |kmh: f64| {
-        let synthesis = at_speed(model, &style, kmh / 3.6)?;
+        let synthesis = at_speed(model, &tracked.style, kmh / 3.6)?;
         let clip = play(&model.model, &synthesis, &offsets, GENERATED_FPS, Length::Cycles(GENERATED_CYCLES));
         bvh::write_clip(&folder.join(format!("generated/walking_{kmh}kmh.bvh")), &clip, None)?;
         Ok(Generated { kmh, synthesis, clip })
     };
-    let generated = WANTED_KMH.into_iter().map(one).collect::<Result<_>>()?;
-    Ok((style, generated))
+    WANTED_KMH.into_iter().map(one).collect()
 }
 
 /// As `muybridge generate` does it without options.

@@ -5,36 +5,28 @@ use std::path::Path;
 use anyhow::Result;
 use muybridge::body::{Clip, Joint};
 use muybridge::math::rotation::log;
-use muybridge::motion_model::{Cycle, SAMPLES};
-use muybridge::phantom::DepthMap;
+use muybridge::motion_model::{Cycle, Model, SAMPLES};
 use muybridge::report::{self, Curve};
 
 use super::{Generated, Truth};
 use crate::cli::outputs::own_cycle;
-use crate::cli::track::{self, NamedModel, Tracked};
+use crate::cli::track::Tracked;
 
 /// Figures of one row of the speeds, over this time.
 const FIGURES: usize = 7;
 const SECONDS: f64 = 1.5;
 
-pub fn draw(
-    folder: &Path,
-    truth: &Truth,
-    model: &NamedModel,
-    tracked: &Tracked,
-    made: &[Generated],
-    depth: Option<&DepthMap>,
-) -> Result<()> {
+pub fn draw(folder: &Path, truth: &Truth, model: &Model, tracked: &Tracked, made: &[Generated]) -> Result<()> {
     report::save(&folder.join("angles.png"), &angles(truth, model, tracked)?)?;
     report::save(&folder.join("speeds.png"), &speeds(made)?)?;
-    if let Some(depth) = depth {
+    if let Some((_, depth)) = &tracked.depth {
         report::save(&folder.join("depth.png"), &report::person_depth(depth, "Measured depth, middle frame")?)?;
     }
     Ok(())
 }
 
-fn angles(truth: &Truth, model: &NamedModel, tracked: &Tracked) -> Result<image::RgbImage> {
-    let found = own_cycle(&model.model, &track::style(&tracked.fit, model));
+fn angles(truth: &Truth, model: &Model, tracked: &Tracked) -> Result<image::RgbImage> {
+    let found = own_cycle(model, &tracked.style);
     let mut series = Vec::new();
     // The knee bends backwards: turns the other way about the axis to the left.
     for (colour, (name, joint, sign)) in [("hip", Joint::RHip, -1.0), ("knee", Joint::RKnee, 1.0)].into_iter().enumerate() {

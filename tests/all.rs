@@ -1,0 +1,32 @@
+//! Tests of the commands and of the library as its users see it, one program so that it is linked once and both cores stay busy.
+
+mod animal;
+mod animal_sketch;
+mod bad_input;
+mod batch;
+mod blend;
+mod browser;
+mod calibrate;
+mod check;
+mod common;
+mod demo;
+mod determinism;
+mod faults;
+mod fit_synthetic;
+mod generate_over_time;
+mod hard_footage;
+mod identity;
+mod layout;
+mod marker_ik;
+mod model_and_generate;
+mod outputs;
+mod parser_torture;
+mod people;
+mod planted_feet;
+mod real_motion;
+mod recording;
+mod report;
+mod rig_files;
+mod study;
+mod style_runners;
+mod trials;
