@@ -7,7 +7,7 @@
 //! inside, and limbs found 2 to 5 % too wide in noise; with the nearest y, whatever Σ, points behind a limb's middle go to its
 //! back, and at a disparity noise of 1 px bodies came out 40 instead of 13 mm off. From afar fewer steps lead there with x in
 //! place of y.
-//! A point near the back of a limb, within 3 σ, was seen on its front, if no other limb is before it: y is there in the line of sight.
+//! A point near the back of a limb, within c σ, was seen on its front, if no other limb is before it: y is there in the line of sight.
 //! Without this an arm that came to lie before its points stays there. Other points behind the skin count nothing: drawn
 //! to a front from farther off a third of clutter made 44 mm of 10, drawn to another limb's the filmed run 29 mm of 24.
 //! As [`PointResidual::Ray`] a cloud point counts with how far, t, it lies along its line of sight d behind where that meets the
@@ -84,8 +84,6 @@ pub(super) struct FrozenOutside {
 const CAUCHY: f64 = 2.385;
 /// The same for silhouettes: a limb far outside is a hole in the mask less often than a limb out of place.
 const OUTSIDE_CAUCHY: f64 = 6.0;
-/// Square of three standard deviations: nearer points are the skin's.
-const OWN_SQUARE: f64 = 9.0;
 /// Skin whose outward normal makes a larger cosine than this with the line of sight is not seen.
 const FACING: f64 = 0.2;
 /// As the surface itself leaves primitives out, so that exact points of the skin have no distance.
@@ -165,7 +163,7 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
         let (mut at, mut near) = (at, near);
         let (mut normal, mut hidden, mut variance, mut precision) = looked_at(&evaluation);
         let to_back_m = (x - at).dot(&normal) + evaluation.distance();
-        if is_distance && hidden && to_back_m * to_back_m * precision < OWN_SQUARE {
+        if is_distance && hidden && to_back_m * to_back_m * precision < CAUCHY * CAUCHY {
             (at, near) = front_of_limb(surface, &known.viewpoint, &x, (at, near), &mut evaluation);
             (normal, hidden, variance, precision) = looked_at(&evaluation);
         }
@@ -187,7 +185,7 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
         let robust = if hidden { 0.0 } else { 1.0 / (1.0 + scaled) };
         fitness.cost += base * 0.5 * CAUCHY * CAUCHY * scaled.ln_1p();
         fitness.effective += base * robust;
-        if distance * distance * precision < OWN_SQUARE && is_point {
+        if distance * distance * precision < 9.0 && is_point {
             fitness.inliers += 1;
             fitness.inlier_square += distance * distance;
         }
@@ -412,7 +410,7 @@ mod tests {
             let frame = Frame { targets: vec![Target::Point { x, covariance: Matrix3::zeros() }], ..Frame::default() };
             for at_skin in [false, true] {
                 let found = freeze(&frame, &surface, &Settings { at_skin, model_m: 0.03, ..SETTINGS }, &KNOWN).0.remove(0);
-                if behind_m > 0.05 + 3.0 * 0.03 {
+                if behind_m > 0.05 + CAUCHY * 0.03 {
                     assert!(found.weight == 0.0, "{found:?}");
                     continue;
                 }
