@@ -2,7 +2,7 @@
 
 use muybridge::motion_model::{Activity, Cycle, Model, database};
 use muybridge::style::curves::mean_vector;
-use muybridge::style::{Population, Style, curves::knots, identity};
+use muybridge::style::{Pace, Population, Style, curves::knots, identity};
 use nalgebra::DVector;
 use rayon::prelude::*;
 
@@ -31,7 +31,8 @@ fn recorded_walkers_are_found_by_evidence() {
                 let knot = &knots(&members)[0];
                 let vector = mean_vector(knot);
                 let weights: DVector<f64> = model.project(&vector).rows(0, COMPONENTS).into_owned();
-                let style = Style::of_weights(&model, "", &weights, knot.parameter, 0.9, 1.0);
+                let style =
+                    Style::of_weights(&model, "", &weights, Pace { parameter: knot.parameter, hip_height_m: 0.9, frequency_hz: 1.0 });
                 let population = Population::new(&model, COMPONENTS);
                 let odds = identity::recognise(&population, &model, &vector, knot.parameter).unwrap().odds;
                 let best = odds.iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();

@@ -18,7 +18,7 @@ use muybridge::motion_model::{Activity, Model, synthetic};
 use muybridge::phantom::{self, DepthMap};
 use muybridge::report::{self, track::UNDECIDED, walk::BAND};
 use muybridge::rig::{Rig, Up};
-use muybridge::style::Style;
+use muybridge::style::{Pace, Style};
 use nalgebra::{DVector, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
@@ -279,12 +279,13 @@ fn placements(fit: &Fit) -> Vec<Placement> {
 /// The person's style with its covariance.
 pub fn style(fit: &Fit, model: &NamedModel) -> Style {
     let weights = DVector::from_column_slice(&fit.state.weights);
-    let hip_height = fit.shape().hip_height_m();
     let rows = 0..weights.len();
     let covariance =
         rows.clone().map(|i| rows.clone().map(|j| fit.uncertainty.as_ref().map_or(f64::NAN, |u| u.shared[(i, j)])).collect()).collect();
-    let (parameter, departure) = (fit.parameter(model.model.activity), own_motion::departure(fit, &model.model));
-    let style = Style::of_tracked(&model.model, &model.hash, &weights, parameter, hip_height, fit.cadence_hz, departure);
+    let parameter = fit.parameter(model.model.activity);
+    let pace = Pace { parameter, hip_height_m: fit.shape().hip_height_m(), frequency_hz: fit.cadence_hz };
+    let departure = own_motion::departure(fit, &model.model);
+    let style = Style::of_tracked(&model.model, &model.hash, &weights, pace, departure);
     Style { covariance: Some(covariance), shape: Some(fit.shape().clone()), ..style }
 }
 

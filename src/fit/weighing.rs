@@ -127,21 +127,22 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
     let frozen = frame.targets.iter().map(|target| {
         let (x, near, deeper_m, base) = match target {
             Target::Point { x, .. } if settings.residual == PointResidual::Ray => {
-                let y = front(surface, &known.viewpoint, x, &mut evaluation);
+                let (y, near) = front(surface, &known.viewpoint, x, &mut evaluation);
                 let deeper_m = (x - known.viewpoint).norm() - (y - known.viewpoint).norm();
-                (y, surface.near(&y, MARGIN, &mut evaluation), deeper_m, settings.point_weight)
+                (y, near, deeper_m, settings.point_weight)
             }
-            Target::Point { x, .. } => (*x, surface.near(x, MARGIN, &mut evaluation), 0.0, settings.point_weight),
+            Target::Point { x, .. } => (*x, evaluate_near(surface, x, &mut evaluation), 0.0, settings.point_weight),
             Target::Ray { origin, direction, .. } => {
                 let (along, near) = surface.nearest_on_line(origin, direction, MARGIN, [CANDIDATES, STEPS], &mut evaluation);
-                (origin + direction * along, near, 0.0, settings.ray_weight)
+                let x = origin + direction * along;
+                surface.evaluate_among(&near, &x, &mut evaluation);
+                (x, near, 0.0, settings.ray_weight)
             }
         };
-        surface.evaluate_among(&near, &x, &mut evaluation);
         let is_point = matches!(target, Target::Point { .. });
         let is_distance = is_point && settings.residual == PointResidual::Distance;
         let to_skin = settings.at_skin && (!is_point || is_distance);
-        let (at, near) = match target {
+        let (mut at, mut near) = match target {
             _ if !to_skin => (x, near),
             Target::Point { covariance, .. } => {
                 let sight = (x - known.viewpoint).normalize();
@@ -158,15 +159,15 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
                 }
                 Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), near_floor(known, &x)),
             };
-            (normal, hidden, variance, 1.0 / (variance + settings.model_m * settings.model_m))
+            (normal, hidden, variance)
         };
-        let (mut at, mut near) = (at, near);
-        let (mut normal, mut hidden, mut variance, mut precision) = looked_at(&evaluation);
+        let (mut normal, mut hidden, mut variance) = looked_at(&evaluation);
         let to_back_m = (x - at).dot(&normal) + evaluation.distance();
-        if is_distance && hidden && to_back_m * to_back_m * precision < CAUCHY * CAUCHY {
+        if is_distance && hidden && to_back_m.powi(2) < CAUCHY.powi(2) * (variance + settings.model_m.powi(2)) {
             (at, near) = front_of_limb(surface, &known.viewpoint, &x, (at, near), &mut evaluation);
-            (normal, hidden, variance, precision) = looked_at(&evaluation);
+            (normal, hidden, variance) = looked_at(&evaluation);
         }
+        let precision = 1.0 / (variance + settings.model_m.powi(2));
         let behind = hidden && is_point;
         let frozen = Frozen {
             x: at,
@@ -249,11 +250,9 @@ fn front_of_limb(
     evaluation: &mut Evaluation,
 ) -> (Vector3<f64>, Near) {
     let back = limb(surface, evaluation);
-    let y = front(surface, eye, x, evaluation);
-    let near = surface.near(&y, MARGIN, evaluation);
-    surface.evaluate_among(&near, &y, evaluation);
+    let found = front(surface, eye, x, evaluation);
     if limb(surface, evaluation) == back {
-        return (y, near);
+        return found;
     }
     surface.evaluate_among(&place.1, &place.0, evaluation);
     place
@@ -278,8 +277,7 @@ fn foot(
     for _ in 0..2 {
         if evaluation.gradient.normalize().dot(noise) > FACING * noise.norm() {
             y -= noise;
-            near = surface.near(&y, MARGIN, evaluation);
-            surface.evaluate_among(&near, &y, evaluation);
+            near = evaluate_near(surface, &y, evaluation);
         }
     }
     for step in 0..TO_SKIN {
@@ -299,8 +297,15 @@ fn foot(
 const TO_FRONT_M: f64 = 0.04;
 const HALVINGS: usize = 6;
 
-/// Where the line of sight from `eye` to `x` first meets the skin; its point nearest to the skin where it misses.
-fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> Vector3<f64> {
+/// Where the line of sight from `eye` to `x` first meets the skin, its point nearest to the skin where it misses, and what makes
+/// the skin there; the surface then is evaluated there.
+fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> (Vector3<f64>, Near) {
+    let y = eye + (x - eye).normalize() * along_to_front(surface, eye, x, evaluation);
+    (y, evaluate_near(surface, &y, evaluation))
+}
+
+/// How far from `eye` that is, metres.
+fn along_to_front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> f64 {
     let direction = (x - eye).normalize();
     let (nearest, near) = surface.nearest_on_line(eye, &direction, MARGIN, [CANDIDATES, STEPS], evaluation);
     let mut inside = |along: f64| {
@@ -314,7 +319,7 @@ fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluatio
         -from.dot(&step) / step.norm_squared()
     };
     let places = near.indices().map(closest).chain([nearest]);
-    let Some(mut within) = places.filter(|along| inside(*along)).reduce(f64::min) else { return eye + direction * nearest };
+    let Some(mut within) = places.filter(|along| inside(*along)).reduce(f64::min) else { return nearest };
     while within > TO_FRONT_M && inside(within - TO_FRONT_M) {
         within -= TO_FRONT_M;
     }
@@ -323,7 +328,14 @@ fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluatio
         let middle = 0.5 * (outside + within);
         if inside(middle) { within = middle } else { outside = middle }
     }
-    eye + direction * (0.5 * (outside + within))
+    0.5 * (outside + within)
+}
+
+/// The primitives that count at `y`; the surface then is evaluated there.
+fn evaluate_near(surface: &PosedSurface, y: &Vector3<f64>, evaluation: &mut Evaluation) -> Near {
+    let near = surface.near(y, MARGIN, evaluation);
+    surface.evaluate_among(&near, y, evaluation);
+    near
 }
 
 #[cfg(test)]
@@ -469,7 +481,7 @@ mod tests {
             let direction = (p.centre - eye).normalize();
             let root = |along: f64| surface.evaluate(&(eye + direction * along)).root();
             let dense = (4000..8000).map(|i| i as f64 * 5e-4).find(|along| root(*along) < SKIN.sqrt());
-            let found = (front(&surface, &eye, &(eye + direction), &mut Evaluation::default()) - eye).norm();
+            let found = (front(&surface, &eye, &(eye + direction), &mut Evaluation::default()).0 - eye).norm();
             // Fields of primitives beside the line, which it leaves out, move the skin by less than a millimetre.
             if let Some(first) = dense {
                 assert!((found - first).abs() < 1e-3, "{found} {first}");
@@ -488,7 +500,7 @@ mod tests {
         let eye = KNOWN.viewpoint;
         let mut targets = Vec::new();
         for p in &surface.primitives {
-            let y = front(&surface, &eye, &p.centre, &mut Evaluation::default());
+            let y = front(&surface, &eye, &p.centre, &mut Evaluation::default()).0;
             let normal = surface.gradient(&y).normalize();
             if surface.distance(&y).abs() < 1e-3 && normal.dot(&(y - eye).normalize()) < -0.7 {
                 targets.push(Target::Point { x: y + normal * 0.004, covariance: nalgebra::Matrix3::zeros() });

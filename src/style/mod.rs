@@ -73,6 +73,16 @@ impl From<Recognised> for Expected {
     }
 }
 
+/// How large somebody is and how fast the observed motion went.
+#[derive(Clone, Copy, Debug)]
+pub struct Pace {
+    /// Speed in m/s, for jumps the length in m.
+    pub parameter: f64,
+    pub hip_height_m: f64,
+    /// Cycles per second.
+    pub frequency_hz: f64,
+}
+
 /// One person's style as observed once.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -220,48 +230,33 @@ impl Style {
         nearest.1
     }
 
-    /// From weights that were observed at `parameter` with cycles of `frequency_hz`.
-    pub fn of_weights(
-        model: &Model,
-        model_hash: &str,
-        weights: &DVector<f64>,
-        parameter: f64,
-        hip_height_m: f64,
-        frequency_hz: f64,
-    ) -> Style {
-        let neighbours = Population::new(model, weights.len()).neighbours(model, weights, parameter);
-        Style { neighbours, ..Style::alone(model, model_hash, weights, parameter, hip_height_m, frequency_hz) }
+    /// From weights that were observed.
+    pub fn of_weights(model: &Model, model_hash: &str, weights: &DVector<f64>, pace: Pace) -> Style {
+        let population = Population::new(model, weights.len());
+        Style::alone(model, model_hash, weights, pace).among(model, &population, weights, None)
     }
 
     /// The same of a tracked motion, with what of it the weights do not hold: with the odds that this is one of the database's
     /// subjects, the expected weights, and distances from these.
-    pub fn of_tracked(
-        model: &Model,
-        model_hash: &str,
-        weights: &DVector<f64>,
-        parameter: f64,
-        hip_height_m: f64,
-        frequency_hz: f64,
-        departure: Option<Departure>,
-    ) -> Style {
-        let style = Style::alone(model, model_hash, weights, parameter, hip_height_m, frequency_hz).departing(departure);
+    pub fn of_tracked(model: &Model, model_hash: &str, weights: &DVector<f64>, pace: Pace, departure: Option<Departure>) -> Style {
+        let style = Style::alone(model, model_hash, weights, pace).departing(departure);
         let population = Population::new(model, weights.len());
         let found = style.recognise(model, &population);
         let place = found.as_ref().map_or(weights, |f| &f.weights);
-        let neighbours = with_odds(population.neighbours(model, place, parameter), found.as_ref());
-        Style { neighbours, expected: found.map(Expected::from), ..style }
+        let style = style.among(model, &population, place, found.as_ref());
+        Style { expected: found.map(Expected::from), ..style }
     }
 
     /// Without anybody beside it.
-    fn alone(model: &Model, model_hash: &str, weights: &DVector<f64>, parameter: f64, hip_height_m: f64, frequency_hz: f64) -> Style {
+    fn alone(model: &Model, model_hash: &str, weights: &DVector<f64>, pace: Pace) -> Style {
         Style {
             activity: model.activity,
             model_hash: model_hash.to_string(),
-            parameter,
-            hip_height_m,
+            parameter: pace.parameter,
+            hip_height_m: pace.hip_height_m,
             weights: weights.iter().copied().collect(),
             covariance: None,
-            cadence_factor: frequency_hz / model.cadence().frequency_hz(parameter, hip_height_m),
+            cadence_factor: pace.frequency_hz / model.cadence().frequency_hz(pace.parameter, pace.hip_height_m),
             expected: None,
             neighbours: Vec::new(),
             shape: None,
@@ -269,6 +264,16 @@ impl Style {
             detail: None,
             also: Vec::new(),
         }
+    }
+
+    /// With the database's subjects by their distance from `place`, and the odds of those that were recognised.
+    fn among(self, model: &Model, population: &Population, place: &DVector<f64>, found: Option<&Recognised>) -> Style {
+        let mut neighbours = population.neighbours(model, place, self.parameter);
+        for (subject, odds) in found.iter().flat_map(|f| &f.odds) {
+            let neighbour = neighbours.iter_mut().find(|n| n.subject == *subject);
+            neighbour.into_iter().for_each(|n| n.log_odds = Some(*odds));
+        }
+        Style { neighbours, ..self }
     }
 
     /// One person's recorded cycles: the mean at the parameter with the most of them, the means at the others beside it;
@@ -283,21 +288,12 @@ impl Style {
         let n = cycles.len() as f64;
         let hip_height_m = cycles.iter().map(|c| c.hip_height_m).sum::<f64>() / n;
         let frequency_hz = first.cadence_factor * model.cadence().frequency_hz(first.parameter, hip_height_m);
-        let style = Style::alone(model, model_hash, &weights, first.parameter, hip_height_m, frequency_hz);
-        let style = Style { detail: first.detail, also, ..style };
+        let pace = Pace { parameter: first.parameter, hip_height_m, frequency_hz };
+        let style = Style { detail: first.detail, also, ..Style::alone(model, model_hash, &weights, pace) };
         let population = Population::new(model, weights.len());
         let found = style.recognise(model, &population);
-        let neighbours = with_odds(population.neighbours(model, &weights, style.parameter), found.as_ref());
-        Some(Style { neighbours, ..style })
+        Some(style.among(model, &population, &weights, found.as_ref()))
     }
-}
-
-fn with_odds(mut neighbours: Vec<Neighbour>, found: Option<&Recognised>) -> Vec<Neighbour> {
-    for (subject, odds) in found.iter().flat_map(|f| &f.odds) {
-        let neighbour = neighbours.iter_mut().find(|n| n.subject == *subject);
-        neighbour.into_iter().for_each(|n| n.log_odds = Some(*odds));
-    }
-    neighbours
 }
 
 #[cfg(test)]
@@ -312,7 +308,7 @@ mod tests {
         let model = Model::build(Activity::Walking, true, &(1..=6).flat_map(people).collect::<Vec<_>>()).unwrap();
         let weights = model.project(&model.vector_of(&people(1000)[1])).rows(0, 5).into_owned();
         let bent = Departure { turns: [("l_knee".to_string(), vec![[0.1, 0.0, 0.0]])].into(), root_height: -0.02 };
-        let plain = Style::of_weights(&model, "", &weights, 1.2, 0.9, 0.95);
+        let plain = Style::of_weights(&model, "", &weights, Pace { parameter: 1.2, hip_height_m: 0.9, frequency_hz: 0.95 });
         let style = plain.clone().departing(Some(bent.clone()));
         let population = Population::new(&model, 5);
         let knee = 3 * (Joint::LKnee as usize - 1);

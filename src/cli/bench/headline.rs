@@ -138,9 +138,8 @@ impl<'a> Person<'a> {
     /// Films, tracks, generates, measures; writes the person's folder.
     fn scores(&self, args: &HeadlineArgs) -> Result<Vec<Score>> {
         let folder = args.output.join(self.name);
-        let fit = self.track(args, &folder)?;
+        let (fit, tracked) = self.track(args, &folder)?;
         let (model, hash) = (&self.others.model, &self.others.hash);
-        let tracked = track::style(&fit, &self.others);
         write_style(&folder.join("style.json"), &tracked)?;
         let recorded = Style::of_cycles(model, hash, &self.seen).context("no cycle at the filmed speed")?;
         println!(
@@ -171,8 +170,8 @@ impl<'a> Person<'a> {
         Ok(scores)
     }
 
-    /// The recording before the phantom's rig, and the fit to what is seen of it.
-    fn track(&self, args: &HeadlineArgs, folder: &Path) -> Result<Fit> {
+    /// The recording before the phantom's rig, and the fit to what is seen of it with the style.
+    fn track(&self, args: &HeadlineArgs, folder: &Path) -> Result<(Fit, Style)> {
         let rig = calib_toml::parse_rig(RIG, Path::new("calib/phantom_lab.toml"))?;
         let read = read_clip(&self.entry.path)?;
         let clip = overground(&read.clip, self.filmed());
@@ -186,13 +185,23 @@ impl<'a> Person<'a> {
         if args.sighted { self.sight(args, &rig, &shape, poses, &options) } else { self.film(args, folder, &rig, &shape, poses, &options) }
     }
 
-    fn sight(&self, args: &HeadlineArgs, rig: &Rig, shape: &Shape, poses: &[Pose], options: &FitOptions) -> Result<Fit> {
+    fn sight(&self, args: &HeadlineArgs, rig: &Rig, shape: &Shape, poses: &[Pose], options: &FitOptions) -> Result<(Fit, Style)> {
         let frames: Vec<(usize, f64)> = (0..poses.len()).map(|i| (i, i as f64 / args.fps)).collect();
         let seen = observe(rig, shape, &frames, poses, &SightOptions::default())?;
-        Ok(fit::fit(&seen, rig, &[&self.others.model], Some(0.0), options, &|_| !interrupt::came())?)
+        let fit = fit::fit(&seen, rig, &[&self.others.model], Some(0.0), options, &|_| !interrupt::came())?;
+        let style = track::style(&fit, &self.others);
+        Ok((fit, style))
     }
 
-    fn film(&self, args: &HeadlineArgs, folder: &Path, rig: &Rig, shape: &Shape, poses: &[Pose], options: &FitOptions) -> Result<Fit> {
+    fn film(
+        &self,
+        args: &HeadlineArgs,
+        folder: &Path,
+        rig: &Rig,
+        shape: &Shape,
+        poses: &[Pose],
+        options: &FitOptions,
+    ) -> Result<(Fit, Style)> {
         let path: Vec<_> = poses.iter().map(|p| p.root).collect();
         let scene = Scene::new(Stage::around(rig, &path), shape);
         write_session(&folder.join("session"), &Take { scene: &scene, rig, poses, fps: args.fps, depth_every: None })?;
@@ -200,7 +209,7 @@ impl<'a> Person<'a> {
         let seen = track::look(&session, None, |_, _, _| Ok(()))?;
         let tracked = track::fit_to(&session, seen, std::slice::from_ref(&self.others), options, None)?;
         track::write(&folder.join("track"), &session, std::slice::from_ref(&self.others), &tracked)?;
-        Ok(tracked.fit)
+        Ok((tracked.fit, tracked.style))
     }
 
     /// Strips over the recordings and over the nearest person of the database.
