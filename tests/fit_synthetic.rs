@@ -116,8 +116,13 @@ fn a_walk_of_the_model_comes_back_from_noisy_points_and_masks() {
     let bridged = fit(&gaps, &rig, &[&model], Some(floor), &options, &|_| true).unwrap();
     let errors = joint_errors(&positions(bridged.shape(), &bridged.poses), &positions(&truth.shape, &true_poses));
     assert!(bridged.poses.len() == 26 && errors.absolute_m < 0.03 && errors.swapped_over_straight > 2.0, "{errors:?}");
-    // Stopped late and taken up again, it ends as if nothing had been.
+    // The last stage ends where joints are still.
     let kept = kept.into_inner();
+    let places = |state: &State| positions(&state.shape, &poses(state, &curve)).concat();
+    let [(before, _), (after, end)] = [2, 1].map(|k| &kept[kept.len() - k]).map(|(_, at)| (places(&at.state), at));
+    let moved_m = (before.iter().zip(&after).map(|(a, b)| (a - b).norm_squared()).sum::<f64>() / after.len() as f64).sqrt();
+    assert!(end.rounds > 1 && moved_m > 1e-5 && moved_m < 5e-4 && (moved_m - end.moved_m).abs() < 1e-9, "{moved_m} {}", end.moved_m);
+    // Stopped late and taken up again, it ends as if nothing had been.
     let until = &kept[..kept.len() * 9 / 10];
     let (last, more) = (|stage: usize| until.iter().rev().find(|k| k.0 == stage).map(|k| k.1.clone()), std::cell::Cell::new(0));
     let again = Checkpoints { load: &last, save: &|_, _| more.set(more.get() + 1) };

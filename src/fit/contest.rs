@@ -21,7 +21,7 @@ use super::problem::{Frame, Free, Known, Problem, Settings};
 use super::start::{self, Hypothesis, Track};
 use super::state::State;
 use super::weighing::total;
-use super::{PLACED, Run, SETTINGS, STYLED, Stage, TURNED};
+use super::{PLACED, ROUGHLY_M, Run, SETTINGS, STYLED, Stage, TURNED};
 use crate::math::arrow::ArrowProblem;
 use crate::motion_model::Model;
 
@@ -121,7 +121,7 @@ fn styled(known: &Known, state: State, frames: &[Frame], ten: &Curve) -> State {
 }
 
 fn stage(free: Free, model_m: f64, refreshes: usize) -> Stage {
-    Stage { free, settings: rough(model_m), refreshes, least_change: 1e-3 }
+    Stage { free, settings: rough(model_m), refreshes, still_m: ROUGHLY_M }
 }
 
 /// Frames at least [`APART_S`] apart, the first and the last among them; all where that leaves fewer than [`FEWEST_FRAMES`].

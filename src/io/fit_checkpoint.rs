@@ -1,6 +1,6 @@
 //! The state of a fit between two iterations, kept on disk exactly, so that a fit that was stopped goes on with the same numbers.
 //!
-//! One file per stage of the fit, little endian: `MBFIT002`; rounds and iterations (u64), cost of the round before (f64);
+//! One file per stage of the fit, little endian: `MBFIT003`; rounds and iterations (u64), how far the last round moved joints (f64);
 //! stature, lengths, widths, posture; number of weights (u64) and weights; number of frames (u64) and per frame position,
 //! rotation (x y z w), phase; number of deviations (u64) and deviations (all f64); BLAKE3 of all before it.
 
@@ -13,7 +13,7 @@ use crate::body::Shape;
 use crate::fit::Checkpoint;
 use crate::fit::state::{Carrier, State};
 
-const MAGIC: &[u8; 8] = b"MBFIT002";
+const MAGIC: &[u8; 8] = b"MBFIT003";
 
 fn path(folder: &Path, stage: usize) -> PathBuf {
     folder.join(format!("{stage:02}.fit"))
@@ -25,7 +25,7 @@ pub fn write(folder: &Path, stage: usize, at: &Checkpoint) -> std::io::Result<()
     bytes.extend((at.rounds as u64).to_le_bytes());
     bytes.extend(at.iterations.to_le_bytes());
     let State { carriers, weights, shape, posture, deviations } = &at.state;
-    put(&mut bytes, &[at.cost, shape.stature_m]);
+    put(&mut bytes, &[at.moved_m, shape.stature_m]);
     put(&mut bytes, &shape.lengths);
     put(&mut bytes, &shape.widths);
     put_turns(&mut bytes, posture);
@@ -53,13 +53,13 @@ pub fn read(folder: &Path, stage: usize) -> Option<Checkpoint> {
     }
     let mut rest = body.strip_prefix(MAGIC)?;
     let (rounds, iterations) = (usize::try_from(take_count(&mut rest)?).ok()?, take_count(&mut rest)?);
-    let [cost, stature_m] = take(&mut rest)?;
+    let [moved_m, stature_m] = take(&mut rest)?;
     let shape = Shape { stature_m, lengths: take(&mut rest)?, widths: take(&mut rest)? };
     let posture = take_turns(&mut rest)?;
     let weights = (0..take_count(&mut rest)?).map(|_| take::<1>(&mut rest).map(|[w]| w)).collect::<Option<_>>()?;
     let carriers = (0..take_count(&mut rest)?).map(|_| take_carrier(&mut rest)).collect::<Option<_>>()?;
     let deviations = (0..take_count(&mut rest)?).map(|_| take_turns(&mut rest)).collect::<Option<_>>()?;
-    Some(Checkpoint { rounds, iterations, cost, state: State { carriers, weights, shape, posture, deviations } })
+    Some(Checkpoint { rounds, iterations, moved_m, state: State { carriers, weights, shape, posture, deviations } })
 }
 
 fn put(bytes: &mut Vec<u8>, values: &[f64]) {
@@ -122,7 +122,7 @@ mod tests {
             posture: std::array::from_fn(third),
             deviations: (1..6).map(turns).collect(),
         };
-        Checkpoint { rounds: 3, iterations: 4, cost: 1e3 / 3.0, state }
+        Checkpoint { rounds: 3, iterations: 4, moved_m: 1e-3 / 3.0, state }
     }
 
     #[test]
@@ -134,7 +134,7 @@ mod tests {
         for (stage, at) in [checkpoint(), plain].iter().enumerate() {
             write(folder.path(), stage, at).unwrap();
             let back = read(folder.path(), stage).unwrap();
-            assert_eq!((back.rounds, back.iterations, back.cost.to_bits()), (3, 4, at.cost.to_bits()));
+            assert_eq!((back.rounds, back.iterations, back.moved_m.to_bits()), (3, 4, at.moved_m.to_bits()));
             let (a, b) = (&back.state, &at.state);
             assert_eq!((&a.weights, &a.shape, &a.posture, &a.deviations), (&b.weights, &b.shape, &b.posture, &b.deviations));
             for (a, b) in a.carriers.iter().zip(&b.carriers) {
