@@ -175,7 +175,8 @@ const ROUGHLY_M: f64 = 2e-3;
 const CLOSELY_M: f64 = 5e-4;
 /// Walks take 2 to 8 in a stage. A run without silhouettes takes 20: after 10 its joints are 44 instead of 31 mm off.
 const MOST_ROUNDS: usize = 30;
-/// With ten weights, which are too few for a fast run: its cost rises from the third on, and after 10 its joints stay 29 instead of 11 mm off.
+/// With ten weights, which are too few for some fast runs: their cost rises from the third round on, and where ten are made an arm
+/// is lost for good, joints 29 instead of 11 mm off.
 const FIRST_ROUNDS: usize = 5;
 
 const PLACED: Free = Free { rotation: false, phase: false, weights: false, stature: false, lengths: false, widths: false, posture: false };
