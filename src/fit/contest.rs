@@ -120,8 +120,8 @@ fn styled(known: &Known, state: State, frames: &[Frame], ten: &Curve) -> State {
     Run::rough(known).stage(state, frames, ten, &stage(STYLED, ROUGH_M, 8))
 }
 
-fn stage(free: Free, model_m: f64, refreshes: usize) -> Stage {
-    Stage { free, settings: rough(model_m), refreshes, still_m: ROUGHLY_M }
+fn stage(free: Free, model_m: f64, most_rounds: usize) -> Stage {
+    Stage { free, settings: rough(model_m), most_rounds, still_m: ROUGHLY_M }
 }
 
 /// Frames at least [`APART_S`] apart, the first and the last among them; all where that leaves fewer than [`FEWEST_FRAMES`].

@@ -162,7 +162,7 @@ const CROWDED: usize = 4;
 struct Stage {
     free: Free,
     settings: Settings,
-    refreshes: usize,
+    most_rounds: usize,
     /// Ends after a round that moves joints by less, root mean square over joints and frames, metres. Costs do not tell: as points
     /// begin and cease to count they go up and down by up to 1 % for ever, while joints move by 0.1 to 0.4 mm.
     still_m: f64,
@@ -228,7 +228,7 @@ impl Run<'_> {
         let begun = (self.checkpoints.load)(self.stages);
         let mut at = begun.unwrap_or(Checkpoint { rounds: 0, iterations: 0, moved_m: f64::INFINITY, state });
         let mut before = joints(&at.state, curve);
-        while at.rounds < stage.refreshes && at.moved_m >= stage.still_m {
+        while at.rounds < stage.most_rounds && at.moved_m >= stage.still_m {
             let problem = Problem::new(curve, frames, &stage.settings, stage.free, &self.known, &at.state);
             let (state, summary) = minimise(problem, at.state, &LmOptions { max_iterations: 1, relative_cost: 1e-4 });
             let after = joints(&state, curve);
@@ -312,14 +312,14 @@ pub fn resume(
     let shaped = if options.lengths { SHAPED } else { STYLED };
     let approach =
         Settings { at_skin: false, point_weight: 2.0 * settings.point_weight, ray_weight: 2.0 * settings.ray_weight, ..settings };
-    let approaching = |free, settings, refreshes| Stage { free, settings, refreshes, still_m: ROUGHLY_M };
+    let approaching = |free, settings, most_rounds| Stage { free, settings, most_rounds, still_m: ROUGHLY_M };
     state = run.stage(state, &half, &ten, &approaching(STYLED, Settings { model_m: 0.03, ..approach }, FIRST_ROUNDS));
     step(0.55)?;
     let curve = Curve::new(model, components);
     state.weights.resize(curve.components(), 0.0);
     state = run.stage(state, &half, &curve, &approaching(shaped, approach, MOST_ROUNDS));
     step(0.7)?;
-    let mut last = Stage { free: shaped, settings, refreshes: MOST_ROUNDS, still_m: CLOSELY_M };
+    let mut last = Stage { free: shaped, settings, most_rounds: MOST_ROUNDS, still_m: CLOSELY_M };
     if options.deviations {
         let posed = Stage { free: Free { lengths: options.lengths, ..POSED }, ..last };
         let own = State { deviations: vec![Turns::default(); state.carriers.len()], ..state.clone() };

@@ -139,13 +139,13 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
                 (x, near, 0.0, settings.ray_weight)
             }
         };
+        let sight = (x - known.viewpoint).normalize();
         let is_point = matches!(target, Target::Point { .. });
         let is_distance = is_point && settings.residual == PointResidual::Distance;
         let to_skin = settings.at_skin && (!is_point || is_distance);
         let (mut at, mut near) = match target {
             _ if !to_skin => (x, near),
             Target::Point { covariance, .. } => {
-                let sight = (x - known.viewpoint).normalize();
                 let noise = sight * sight.dot(&(covariance * sight)).sqrt();
                 foot(surface, &x, near, &(covariance + Matrix3::identity() * settings.model_m.powi(2)), &noise, &mut evaluation)
             }
@@ -154,9 +154,7 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
         let looked_at = |evaluation: &Evaluation| {
             let normal = evaluation.gradient.normalize();
             let (variance, hidden) = match target {
-                Target::Point { covariance, .. } => {
-                    (normal.dot(&(covariance * normal)), normal.dot(&(x - known.viewpoint).normalize()) > FACING)
-                }
+                Target::Point { covariance, .. } => (normal.dot(&(covariance * normal)), normal.dot(&sight) > FACING),
                 Target::Ray { origin, sigma, .. } => ((sigma * (x - origin).norm()).powi(2), near_floor(known, &x)),
             };
             (normal, hidden, variance)
@@ -177,7 +175,7 @@ pub(super) fn freeze(frame: &Frame, surface: &PosedSurface, settings: &Settings,
             node: limb(surface, &evaluation),
             is_point,
             residual: if is_point { settings.residual } else { PointResidual::Distance },
-            offset_m: (x - at).dot(&normal) + deeper_m * normal.dot(&(x - known.viewpoint).normalize()),
+            offset_m: (x - at).dot(&normal) + deeper_m * normal.dot(&sight),
             ..Frozen::default()
         };
         let distance_m = frozen.at(evaluation.root()).0;
@@ -300,14 +298,14 @@ const HALVINGS: usize = 6;
 /// Where the line of sight from `eye` to `x` first meets the skin, its point nearest to the skin where it misses, and what makes
 /// the skin there; the surface then is evaluated there.
 fn front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> (Vector3<f64>, Near) {
-    let y = eye + (x - eye).normalize() * along_to_front(surface, eye, x, evaluation);
+    let direction = (x - eye).normalize();
+    let y = eye + direction * along_to_front(surface, eye, &direction, evaluation);
     (y, evaluate_near(surface, &y, evaluation))
 }
 
 /// How far from `eye` that is, metres.
-fn along_to_front(surface: &PosedSurface, eye: &Vector3<f64>, x: &Vector3<f64>, evaluation: &mut Evaluation) -> f64 {
-    let direction = (x - eye).normalize();
-    let (nearest, near) = surface.nearest_on_line(eye, &direction, MARGIN, [CANDIDATES, STEPS], evaluation);
+fn along_to_front(surface: &PosedSurface, eye: &Vector3<f64>, direction: &Vector3<f64>, evaluation: &mut Evaluation) -> f64 {
+    let (nearest, near) = surface.nearest_on_line(eye, direction, MARGIN, [CANDIDATES, STEPS], evaluation);
     let mut inside = |along: f64| {
         let y = eye + direction * along;
         let near = surface.near(&y, MARGIN, evaluation);
